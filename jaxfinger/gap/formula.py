@@ -74,7 +74,7 @@ class Parameters:
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
     unlisted_slope: float = 1.0  # change of the log odds that something is unlisted, per nat left unexplained
-    imitator_odds: float = 8.0  # λ: odds that a cause imitates, if it leaves all energy and the evidence that it brings
+    imitator_odds: float = 8.0  # λ: odds that a cause which leaves as much as it brings imitates something unlisted
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ def _beyond_listed(counts: Counts, evidence: Evidence, p: Parameters) -> Float[n
     return unexplained(counts, evidence, replace(p, form_error=p.form_error_unlisted))
 
 
-def imitates(
+def imitation_odds(
     counts: Counts, without: Evidence, left: Evidence, explainable: Float[np.ndarray, " C"], p: Parameters
 ) -> float:
-    """Probability that a cause of a set, beside something unlisted, only imitates it.
+    """Odds ω that a cause of a set, beside something unlisted that listed causes imitate, is one of those that do.
 
     With l_c = max(e_c − φ K_c, 0) the energy beyond noise that the set leaves, l_c⁰ that without the cause, τ_c,
     `explainable`, as in `costs`, τ'_c the largest τ_c in any column of the channel, and u_c as in `unlisted`,
@@ -159,18 +159,17 @@ def imitates(
         A = Σ_c τ_c (l_c⁰ − l_c),    L = Σ_c τ'_c l_c,    U = Σ_c τ'_c u_c
 
     are the energy that the cause takes away, and the energy and the evidence that stay in the channels where it acts.
-    With G the log evidence that it brings, the odds are λ L / (A + L) · U / G. What is unlisted follows another law and
-    seldom keeps to the one tendon or joint, or to the experiment, where a listed cause imitates it: an imitator leaves
-    a good share of it in the same channels, and brings little more evidence than it leaves there.
+    With G the log evidence that it brings, one nat at least, ω = L / (A + L) · U / G. What is unlisted follows another
+    law and seldom keeps to the one tendon or joint, or to the experiment, where a listed cause imitates it: an imitator
+    leaves a good share of it in the same channels, and brings little more evidence than it leaves there.
     """
     now, before = (np.maximum(x.e - p.variance_floor * counts.K, 0.0) for x in (left, without))
     concerned = counts.largest_of_channel(explainable)
-    taken, stays, gain = float(explainable @ (before - now)), float(concerned @ now), left.score - without.score
-    if taken <= 0.0 or gain <= 0.0:
-        return 1.0
-    evidence = float(concerned @ _beyond_listed(counts, left, p))
-    odds = p.imitator_odds * stays / (taken + stays) * evidence / gain
-    return odds / (1.0 + odds)
+    stays, evidence = float(concerned @ now), float(concerned @ _beyond_listed(counts, left, p))
+    if stays == 0.0:
+        return 0.0
+    taken, gain = max(float(explainable @ (before - now)), 0.0), max(left.score - without.score, 1.0)
+    return stays / (taken + stays) * evidence / gain
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Posterior over all visited sets of causes: probabilities of causes and of «nothing», and ambiguous sets."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -8,7 +9,7 @@ import numpy as np
 from jaxfinger.gap.columns import Counts
 from jaxfinger.gap.costs import CauseKey, Costs
 from jaxfinger.gap.exact import SearchState
-from jaxfinger.gap.formula import Evidence, imitates, unlisted
+from jaxfinger.gap.formula import Evidence, imitation_odds, unlisted
 from jaxfinger.gap.sets import Search
 
 MIN_NAMED_PROBABILITY = 0.5  # More likely at work than not.
@@ -58,13 +59,26 @@ def genuine_probabilities(
 ) -> dict[CauseKey, float]:
     """Probability of each cause of the best set that it does not merely imitate something unlisted.
 
-    It is 1 − P_u I_i. P_u, `other`, is the probability that something unlisted is at work. If it is, cause i imitates
-    it with the probability I_i (`formula.imitates`), which grows with what the set leaves where the cause acts. A cause
-    is left out if the search has not weighed the set without it.
+    Something unlisted is at work with the probability P_u, `other`. Nothing imitates it, or the effects of a set M do,
+    with the odds λ Π_{e∈M} Ω_e, since it is one effect, and hard to imitate or not. Ω_e is the largest ω
+    (`formula.imitation_odds`) of an effect at any of its sites. So cause i of effect e imitates with the probability
+
+        P_u λ ω_i R / (1 + λ ((1 + ω_i) R − 1)),    R = Π_{f≠e} (1 + Ω_f).
+
+    A cause is left out if the search has not weighed the set without it.
     """
     p, left = costs.parameters, evidence[best]
     without = {key: evidence[best - {key}] for key in best if best - {key} in evidence}
-    return {key: 1.0 - other * imitates(counts, x, left, costs.explainable[key], p) for key, x in without.items()}
+    odds = {k: imitation_odds(counts, x, left, costs.explainable[k], p) for k, x in without.items()}
+    largest: dict[str, float] = {}
+    for (effect, _), x in odds.items():
+        largest[effect] = max(x, largest.get(effect, 0.0))
+    out = {}
+    for key, x in odds.items():
+        R = math.prod(1.0 + y for effect, y in largest.items() if effect != key[0])
+        imitates = p.imitator_odds * x * R / (1.0 + p.imitator_odds * ((1.0 + x) * R - 1.0))
+        out[key] = 1.0 - other * imitates
+    return out
 
 
 def ambiguous_sets(

@@ -79,7 +79,21 @@ def test_what_stays_in_another_column_of_the_channel_counts_as_much():
 def test_a_cause_that_brings_much_more_evidence_than_is_left_is_at_work():
     left = {BOTH: (0.0, 3000.0), WITHOUT_STRETCH: (5000.0, 3000.0), WITHOUT_STRIBECK: (0.0, 9000.0)}
     assert genuine(left, gain=10.0)[STRIBECK] < 0.5 < 0.9 < genuine(left, gain=1000.0)[STRIBECK]
-    assert genuine(left, gain=-1.0)[STRIBECK] == pytest.approx(0.0, abs=1e-3)
+    assert genuine(left, gain=-1.0)[STRIBECK] < 0.02
+
+
+def test_what_one_effect_imitates_another_seldom_imitates_too():
+    """Both leave as much as they bring; a second site of one effect makes the other no likelier to be at work."""
+    alone, p = {frozenset({STRETCH}): (3000.0, 3000.0), frozenset(): (6000.0, 6000.0)}, Parameters()
+    beside = {BOTH: (3000.0, 3000.0), WITHOUT_STRETCH: (6000.0, 3000.0), WITHOUT_STRIBECK: (3000.0, 6000.0)}
+    three = frozenset({STRETCH, FURTHER, STRIBECK})
+    further = {three: (3000.0, 3000.0)} | {three - {key}: (6000.0, 6000.0) for key in three}
+    x = 0.5 * 5.0 * np.log(302.0 / p.variance_floor) / 50.0  # odds of each
+    imitates = p.imitator_odds * x * (1.0 + x) / (1.0 + p.imitator_odds * ((1.0 + x) ** 2 - 1.0))
+    assert genuine(alone)[STRETCH] == pytest.approx(1.0 / (1.0 + p.imitator_odds * x))
+    assert genuine(beside)[STRETCH] == pytest.approx(1.0 - imitates) == genuine(beside)[STRIBECK]
+    assert genuine(further)[STRIBECK] == pytest.approx(1.0 - imitates)
+    assert genuine(further)[STRETCH] == genuine(further)[FURTHER] == pytest.approx(1.0 - imitates)
 
 
 def test_the_log_score_of_a_record_is_that_of_its_probabilities():
