@@ -22,6 +22,7 @@ TO_SI = {
     "rad": Unit("rad", 1.0),
     "mrad": Unit("rad", 1e-3),
     "deg": Unit("rad", math.pi / 180.0),
+    "gon": Unit("rad", math.pi / 200.0),
     "turn": Unit("rad", 2.0 * math.pi),
     "m": Unit("m", 1.0),
     "cm": Unit("m", 1e-2),
@@ -52,7 +53,14 @@ TO_SI = {
 _SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 _SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
+_SPELT |= {"revolution": "turn", "cycle": "turn", "cycles": "turn", "umdrehung": "turn", "umdrehungen": "turn"}
+_SPELT |= {"gons": "gon", "gradian": "gon", "gradians": "gon"}
 _SPELT |= {"second": "s", "seconds": "s", "days": "day", "newton": "N", "newtons": "N"}
+_SPELT |= {"secs": "s", "sek": "s", "sekunden": "s", "minute": "min", "minutes": "min", "hour": "h", "hours": "h"}
+_SPELT |= {"millis": "ms", "msec": "ms", "msecs": "ms", "milliseconds": "ms"}
+_SPELT |= {"micros": "us", "usec": "us", "usecs": "us", "microseconds": "us", "nsec": "ns", "nanoseconds": "ns"}
+# Words that are a unit in one language and another unit in others.
+EITHER = {"grad": "deg in German, gon in other languages"}
 # Units of other systems and of raw signals, without capitals and what joins factors: numbers in them are never in SI.
 _FOREIGN = {
     "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa",
@@ -97,6 +105,12 @@ def weight_unit(stated: str) -> str:
 def is_foreign(stated: str) -> bool:
     """Whether a file states a unit that no mapping converts, such as lbf, V or counts."""
     return re.sub(r"[\s·*.-]", "", stated).lower() in _FOREIGN and not unit_name(stated)
+
+
+def is_unknown(stated: str) -> bool:
+    """Whether a file states a word in place of a unit that is none of the known ones, such as `grad`."""
+    known = unit_name(stated) or is_foreign(stated) or is_ratio(stated)
+    return not known and re.search(r"[^\W\d_]", stated) is not None
 
 
 def is_ratio(stated: str) -> bool:

@@ -168,6 +168,7 @@ def _factors(si: str) -> dict[float, str]:
     """Factors that bring wrong signs and units to those of the session, with the name of the wrong unit."""
     units = {u.factor: name for name, u in reversed(TO_SI.items()) if u.si == si and u.factor != 1.0}
     units |= {TO_SI["deg"].factor: "deg"}
+    units.pop(TO_SI["gon"].factor, None)  # Sizes do not tell it from degrees.
     units = {1.0 / f: name for f, name in units.items()} | units
     return {sign * f: name for sign in (1.0, -1.0) for f, name in ({1.0: si} | units).items() if sign * f != 1.0}
 

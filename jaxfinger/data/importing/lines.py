@@ -13,7 +13,7 @@ from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import quoted
-from jaxfinger.data.units import TO_SI
+from jaxfinger.data.units import EITHER, TO_SI
 from jaxfinger.errors import listed
 
 _MAX_SPEEDS = 4  # that are named
@@ -28,30 +28,53 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
 
     A joint that slides is in m; where one turns several times, the sizes of angles do not tell rad from degrees.
     """
-    parts = [f"from = {quoted(seen.name)}"]
+    parts, doubts = [f"from = {quoted(seen.name)}"], []
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
     if log is not None:
         parts.append(f"file = {quoted(log.recording.path.name)}")
         if log.clock is not None:
-            units = f', units = "{log.clock.units}"' if log.clock.units not in ("s", "") else ""
+            units = _units_of_clock(log.clock)
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
+            doubts += [_doubt(log.clock)] if log.clock.foreign else []
     fits = {"q": "rad", "joint_torque": "N m", "tendon_force": "N", "fingertip_force": "N", "tendon_excursion": "m"}
     fits["temperature"] = "K"
     if slides and seen.meaning in _MAX_SLIDING:
         fits[seen.meaning], largest = _MAX_SLIDING[seen.meaning]
         if not (seen.stated or seen.foreign):
             seen = replace(seen, units=fits[seen.meaning] if max(-seen.low, seen.high) <= largest else "")
-    doubts = []
     guessed = seen.meaning == "q" and turns and not seen.stated
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning) and not guessed:
         parts.append(f'units = "{seen.units}"')
     else:
-        parts += [] if seen.foreign else ['units = "?"']
-        doubts.append(f"units? it states {seen.foreign}: write `scale`" if seen.foreign else "its size does not tell")
+        parts.append('units = "?"')
+        doubts.append(_doubt(seen))
     if seen.meaning == "tendon_excursion" and "length" in f"{seen.name} {seen.column or ''}".lower():
         doubts.append("a length that falls as the tendon is pulled in needs scale = -1")
     return "{ " + ", ".join(parts) + " }" + (f"   # {'; '.join(doubts)}" if doubts else "")
+
+
+def time_line(clock: ColumnSurvey) -> str:
+    """Line that reads the times of a trial."""
+    units = _units_of_clock(clock)
+    name = quoted(clock.name)
+    said = f"   # {_doubt(clock)}" if clock.foreign else ""
+    return f"time = {{ from = {name}{units} }}{said}" if units else f"time = {name}"
+
+
+def _units_of_clock(clock: ColumnSurvey) -> str:
+    """Units of times, as an inline table has them: none for s, and open where the recording states unknown ones."""
+    units = "?" if clock.foreign else clock.units
+    return f', units = "{units}"' if units not in ("s", "") else ""
+
+
+def _doubt(seen: ColumnSurvey) -> str:
+    """Why the unit of a column is open."""
+    if seen.foreign:
+        return f"it states {seen.foreign}: {EITHER.get(seen.foreign.lower(), 'write `scale` too, or another unit')}"
+    if seen.whole:
+        return "whole numbers, as counts are: then write `scale` too"
+    return "its size does not tell"
 
 
 def torque_line(columns: Sequence[ColumnSurvey], weight: float) -> list[str]:
@@ -67,11 +90,11 @@ def torque_line(columns: Sequence[ColumnSurvey], weight: float) -> list[str]:
 
 
 def turns_line(columns: Sequence[ColumnSurvey], limits: np.ndarray) -> list[str]:
-    """A comment on angles that are taken for rad, where they lie within the joints' `limits` (m, 2), rad, in turns too.
+    """A comment on angles that may be in rad, where they lie within the joints' `limits` (m, 2), rad, in turns too.
 
     Some motor drives count turns.
     """
-    guessed = [s for s in columns if _is_guessed(s) and s.units == "rad"]
+    guessed = [s for s in columns if _is_guessed(s) and not s.foreign and s.units in ("rad", "")]
     if not guessed:
         return []
     low, high = min(s.low for s in guessed), max(s.high for s in guessed)

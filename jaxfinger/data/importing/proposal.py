@@ -11,7 +11,15 @@ import numpy as np
 from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.experiment import guessed_experiment
-from jaxfinger.data.importing.lines import called, column_line, pace_line, rate_by_speeds, torque_line, turns_line
+from jaxfinger.data.importing.lines import (
+    called,
+    column_line,
+    pace_line,
+    rate_by_speeds,
+    time_line,
+    torque_line,
+    turns_line,
+)
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import is_nameless, is_set_point, words
 from jaxfinger.data.importing.recording import Recording
@@ -124,10 +132,8 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
         lines += pace_line(logs[0], channels.get("q", ()))
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
-    elif clock.units in ("s", ""):
-        lines.append(f"time = {quoted(clock.name)}{guessed}")
     else:
-        lines.append(f'time = {{ from = {quoted(clock.name)}, units = "{clock.units}" }}{guessed}')
+        lines.append(f"{time_line(clock)}{guessed}")
     if clock is None or is_nameless(clock.name):
         lines += rate_by_speeds(logs[0])
     for channel, families in rivals.items():

@@ -14,7 +14,7 @@ from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameles
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.mounting import reach_of, weight_of
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, without_units
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, is_unknown, without_units
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
@@ -22,16 +22,19 @@ MIN_GAP = 5.0
 # Share of a clock's steps that its usual one is not twice or half of.
 _MIN_EVEN = 0.9
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
-# is the guess. Torques from 5 to 100 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
-# gf, so their unit stays open. The finger's own weight tells more of torques.
+# is the guess. Torques from 0.2 to 500 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
+# gf, so their unit stays open. A link of 1 g weighs 0.2 N mm at 2 cm. The finger's own weight tells more of torques.
 _MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
-    "joint_torque": (("N m", 5.0), ("", 100.0), ("N mm", 5e3)),
+    "joint_torque": (("N m", 0.2), ("", 500.0), ("N mm", 5e3)),
     "tendon_force": (("N", 500.0), ("", 1e6)),
     "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
+_MAX_TURNS = (
+    0.3  # Angles that are never larger may be turns, as some motor drives count: a finger's joint makes no more.
+)
 # Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
 # since in N mm they would be a hundredth of it, less than any load moves them. Larger ones than the second are in N mm:
 # `check` refuses them in N m. Between them the unit stays open.
@@ -55,6 +58,7 @@ class ColumnSurvey:
     stated: bool  # whether the recording states the units
     meaning: str  # channel, `time`, or empty
     foreign: str = ""  # unit that the recording states and no mapping converts, such as counts
+    whole: bool = False  # whether its values are whole numbers, as counts are
 
 
 @dataclass(frozen=True)
@@ -105,16 +109,18 @@ def columns_of(
             angles = recording.angles if meaning == "q" and not (units or is_foreign(variable.units)) else ""
             units = units or angles
             stated = bool(units and (variable.units or angles))
-            foreign = variable.units if is_foreign(variable.units) and not units else ""
-            if not units and not foreign:
+            foreign = variable.units if not units and _is_no_unit(variable.units, owners) else ""
+            finite = x[np.isfinite(x)]
+            whole = len(finite) > 0 and bool(np.all(finite == np.round(finite)) and np.ptp(finite) > 0.0)
+            counts = whole and meaning in _MAX_VALUES and meaning != "temperature"
+            if not (units or foreign or counts):
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
                 guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
-            finite = x[np.isfinite(x)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
-            found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign))
-    found = _agreed(found, guessed, owners, weight)
+            found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign, whole))
+    found = _without_turns(_agreed(found, guessed, owners, weight), guessed)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
             x = np.ravel(recording.variables[s.name].values)
@@ -122,6 +128,11 @@ def columns_of(
                 found[k] = replace(s, meaning="time", units=s.units or _time_unit(x))
                 break
     return found
+
+
+def _is_no_unit(stated: str, owners: Owners) -> bool:
+    """Whether a recording states what no mapping converts: another unit, or a word that is no joint's or tendon's."""
+    return is_foreign(stated) or (is_unknown(stated) and not owners.of(words(stated))[0])
 
 
 def _said(recording: Recording, owners: Owners) -> dict[tuple[str, int], tuple[str, str]]:
@@ -185,6 +196,13 @@ def _agreed(
         for i in group:
             agreed[i] = replace(found[i], units=largest if many else "")
     return agreed
+
+
+def _without_turns(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list[ColumnSurvey]:
+    """Columns, with the unit of angles open where all are so small that they may be turns. 0 is 0 in any unit."""
+    sizes = {i: size for i, size in guessed.items() if found[i].units == "rad"}
+    small = 0.0 < max(sizes.values(), default=0.0) <= _MAX_TURNS
+    return [replace(s, units="") if small and i in sizes else s for i, s in enumerate(found)]
 
 
 def _of_one_quantity(

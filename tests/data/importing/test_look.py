@@ -28,7 +28,7 @@ def log(tmp_path):
         GAPPED_MS,
         40 + 30 * np.sin(GAPPED_MS / 1e3),
         80 * np.cos(GAPPED_MS / 1e3),
-        300 * np.sin(GAPPED_MS / 1e2),
+        600 * np.sin(GAPPED_MS / 1e2),
     ]
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack(columns), "%.6f", ",", header="t,enc,dq,tau", comments="")
@@ -114,7 +114,10 @@ def test_units_that_no_mapping_converts_are_said_and_not_guessed_anew(tmp_path, 
     main(["look", str(path)])
     said = capsys.readouterr().out
     assert 'channels.q.J1 = { from = "MCP angle [turns]", units = "turn" }' in said
-    assert 'channels.tendon_excursion.T1 = { from = "T1 length [in]" }   # units? it states in: write `scale`' in said
+    assert (
+        'channels.tendon_excursion.T1 = { from = "T1 length [in]", units = "?" }   # it states in: write `scale` too'
+        in said
+    )
 
 
 def test_the_sign_of_a_tendons_own_length_is_said(tmp_path, capsys):
@@ -415,7 +418,7 @@ def test_units_that_no_size_tells_are_asked_for(tmp_path, capsys):
         main(["import", str(log), "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
     said = capsys.readouterr().err
     assert (
-        "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, turn, and for" in said
+        "channels.q.MCP: has units that are still to be filled in; write one of rad, mrad, deg, gon, turn, and" in said
     )
 
 

@@ -1,0 +1,117 @@
+"""Units of a log's columns: stated ones are read or asked for, and a size that fits several units is asked for."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxfinger.data.importing.by_mapping import import_session
+from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.importing.sources import load_recording
+from jaxfinger.data.importing.survey import columns_of
+from jaxfinger.errors import UserError
+from tests.data.conftest import ONE_JOINT
+
+TIME = np.arange(400) / 100
+SWEEP = 0.5 + 0.4 * np.sin(TIME)  # rad
+
+
+def log(folder: Path, header: str, *columns: np.ndarray, form: str = "%.6f") -> Path:
+    path = folder / "log.csv"
+    np.savetxt(
+        path, np.column_stack([TIME, *columns]), ["%.3f", *[form] * len(columns)], ",", header=header, comments=""
+    )
+    return path
+
+
+def line(path: Path, channel: str) -> str:
+    """What the proposed mapping says of a channel."""
+    return next(said for said in proposal([load_recording(path)]).splitlines() if f"channels.{channel}" in said)
+
+
+@pytest.mark.parametrize(
+    ("stated", "units"),
+    [
+        ("rev", "turn"),
+        ("turns", "turn"),
+        ("cycles", "turn"),
+        ("Umdrehungen", "turn"),
+        ("gon", "gon"),
+        ("grad", "?"),
+        ("pouces", "?"),
+    ],
+)
+def test_a_stated_unit_is_read_and_an_unknown_one_is_asked_for(tmp_path, stated, units):
+    path = log(tmp_path, f"time [s],angle [{stated}]", SWEEP)
+    assert f'units = "{units}"' in line(path, "q")
+    assert (f"it states {stated}" in line(path, "q")) == (units == "?")
+
+
+def test_a_word_behind_a_name_that_is_a_joints_is_no_unit(tmp_path):
+    assert 'units = "rad" }' in line(log(tmp_path, "time [s],angle [MCP]", SWEEP), "q")
+
+
+def test_times_in_an_unknown_unit_are_asked_for(tmp_path):
+    said = proposal([load_recording(log(tmp_path, "time [jiffies],angle [rad]", SWEEP))])
+    assert 'time = { from = "time [jiffies]", units = "?" }   # it states jiffies' in said
+
+
+@pytest.mark.parametrize(("turns", "units"), [(1.0, "rad"), (2 * np.pi, "?")])
+def test_angles_so_small_that_they_may_be_turns_are_asked_for(tmp_path, turns, units):
+    """A joint that is held at a small angle takes the unit of the one that moves."""
+    path = log(tmp_path, "time [s],pos_1,pos_2", SWEEP / turns, np.full(len(TIME), 0.1))
+    assert [s.units or "?" for s in columns_of(load_recording(path))[1:]] == [units, units]
+
+
+def test_an_angle_of_zero_is_zero_in_any_unit(tmp_path):
+    assert 'units = "rad"' in line(log(tmp_path, "time [s],pos", np.zeros(len(TIME))), "q")
+
+
+@pytest.mark.parametrize(("size", "units"), [(0.1, "N m"), (4.0, "?"), (200.0, "?"), (900.0, "N mm")])
+def test_torques_that_may_be_a_fingers_or_an_arms_are_asked_for(tmp_path, size, units):
+    path = log(tmp_path, "time [s],angle [rad],torque", SWEEP, size * np.cos(TIME))
+    assert f'units = "{units}"' in line(path, "joint_torque")
+
+
+def test_whole_numbers_are_taken_for_counts(tmp_path):
+    """However large they are; a number between them shows that they are none."""
+    ticks = np.round(300 * SWEEP)
+    path = log(tmp_path, "time [s],enc,force", ticks, np.round(50 + 10 * np.sin(TIME)), form="%.1f")
+    assert 'units = "?" }   # whole numbers, as counts are' in line(path, "q")
+    assert 'units = "?" }   # whole numbers, as counts are' in line(path, "tendon_force")
+    assert 'units = "deg" }' in line(log(tmp_path, "time [s],enc", ticks + 0.5), "q")
+
+
+@pytest.mark.parametrize(
+    ("derived", "reading"),
+    [
+        ("", '{ from = "enc", scale = "turns_per_count", offset = -0.5, units = "turn" }'),
+        ('[derived]\nangle = "(enc - 2048) / 4096"\n', '{ from = "angle", units = "turn" }'),
+    ],
+    ids=["scale", "formula"],
+)
+def test_counts_become_angles_by_the_counts_in_a_turn(tmp_path, derived, reading):
+    ticks = np.round(2048 + 4096 / (2 * np.pi) * SWEEP)
+    path = log(tmp_path, "t,enc", ticks, form="%.0f")
+    mapping = tmp_path / "m.toml"
+    mapping.write_text(
+        "specimen = 'x'\n[constants]\nturns_per_count = 0.000244140625\n"
+        + derived
+        + ONE_JOINT[ONE_JOINT.index("[finger]") :]
+        + f'[trials.a]\nexperiment = "VD.1"\ntime = "t"\nchannels.q.MCP = {reading}\n'
+        + 'channels.tendon_force.T1 = { from = "enc", scale = 0.0, offset = 2.0 }\n'
+    )
+    session = import_session([path], mapping)
+    assert np.abs(session["a"].q[:, 0] - SWEEP).max() < 1e-3
+
+
+def test_an_open_unit_is_refused(tmp_path):
+    mapping = tmp_path / "m.toml"
+    mapping.write_text(
+        "specimen = 'x'\n"
+        + ONE_JOINT[ONE_JOINT.index("[finger]") :]
+        + '[trials.a]\nexperiment = "VD.1"\ntime = "time [s]"\n'
+        + line(path := log(tmp_path, "time [s],angle [grad]", SWEEP), "q").replace("q.J1", "q.MCP")
+    )
+    with pytest.raises(UserError, match=r"channels.q.MCP: has units that are still to be filled in"):
+        import_session([path], mapping)
