@@ -18,7 +18,7 @@ from jaxfinger.data.importing.variables import Source, column_of, scale_of
 from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import limits_of_turns, unit_name, whole_turns
+from jaxfinger.data.units import TO_SI, limits_of_turns, unit_name, whole_turns
 from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
@@ -342,7 +342,8 @@ class ColumnReader:
         stamp = own.removesuffix(".time") + ".stamp"
         if clock.name.endswith(".stamp") and stamp in known_clocks:
             own = stamp
-        return f"`{own}`", known_clocks[own].values
+        units = unit_name(known_clocks[own].units) or clock.units
+        return f"`{own}`", known_clocks[own].values * TO_SI[units].factor
 
     def _onto(self, time: np.ndarray, values: np.ndarray, name: str, whole: bool, where: Place) -> np.ndarray:
         """Values at the trial's times, interpolated between the samples of their own clock, and NaN beyond its ends.

@@ -29,11 +29,19 @@ class Log:
 
     @property
     def clock(self) -> ColumnSurvey | None:
-        """Column with the times of its samples: stamps of headers before other clocks, these before counts, and those
-        that never run back before others."""
+        """Column with the times of its samples: stamps of headers before other clocks, these before counts, those that
+        never run back before others, and those of angles before others."""
         clocks = [s for s in self.seen if s.meaning == "time"]
+        of_angles = {self.recording.variables[s.name].clock for s in self.seen if s.meaning == "q"}
         return min(
-            clocks, key=lambda s: (not s.name.endswith(".stamp"), self.counts(s), self._runs_back(s)), default=None
+            clocks,
+            key=lambda s: (
+                not s.name.endswith(".stamp"),
+                self.counts(s),
+                self._runs_back(s),
+                s.name not in of_angles,
+            ),
+            default=None,
         )
 
     def counts(self, clock: ColumnSurvey) -> bool:

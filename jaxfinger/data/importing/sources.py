@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data.importing.dates import packed, texts
+from jaxfinger.data.importing.long_table import widened
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.opening import plain_reason
 from jaxfinger.errors import UserError
@@ -39,7 +40,7 @@ def load_recording(path: Path) -> Recording:
     Raises:
         UserError: the file is missing, empty, of an unknown kind, or damaged.
     """
-    return _with_dates(_load(path))
+    return widened(_with_dates(_load(path)))
 
 
 def _with_dates(recording: Recording) -> Recording:
