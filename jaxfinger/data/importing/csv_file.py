@@ -28,6 +28,11 @@ _ANGLES = {"yes": "deg", "no": "rad"}
 _MAX_QUOTED = 40  # characters of a line
 _LOST = "A message was lost!!!", "\ttotal count"  # how lines begin that `ros2 topic echo` writes between messages
 _NO_CHANNEL = "comment"  # the last name in a LabVIEW measurement file, of cells that only the first sample may have
+# A frame of a CAN bus, with its bytes in hexadecimal, as `candump` and Vector's `.asc` write it.
+_FRAME = re.compile(
+    r"\s*(\([\d.]+\)\s+)?[a-z]+\d+\s+[0-9A-F]{3,8}(#|\s+\[\d+\])|\s*[\d.]+\s+\d+\s+[0-9A-F]+x?\s+[RT]x\s+d\s+\d",
+    re.IGNORECASE,
+)
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -49,6 +54,11 @@ def load_csv(path: Path) -> Recording:
     if any(line.text.strip() == "---" for line in body) and any(line.text.strip() == "header:" for line in body):
         raise UserError(f"{path}: holds messages as `ros2 topic echo` prints them; echo with --csv, or record a bag")
     sample = body[len(body) // 2 :][:_DIALECT_LINES]
+    if 2 * sum(_FRAME.match(line.text) is not None for line in sample) > len(sample):
+        raise UserError(
+            f"{path}: holds frames of a CAN bus, whose bytes are no quantities yet; decode them, in Python by "
+            "`cantools` with the drives' .dbc file, or by the drives' manual, and write a CSV with one line a sample"
+        )
     dialect, numeric = find_dialect([line.text for line in sample])
     split = dialect.split
     if not any(numeric) and len(body) == 1:

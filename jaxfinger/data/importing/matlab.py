@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import scipy.io
 import scipy.sparse
+from scipy.io.matlab import MatlabOpaque, varmats_from_mat
 
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.opening import why_closed, why_unreadable
@@ -20,11 +21,16 @@ from jaxfinger.errors import UserError
 
 _NUMBERS = ("double", "single", "logical", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
 _MIN_SPEED = 1e6  # bytes/s: a hundredth of the speed at which SciPy reads a compressed file
-_OBJECT = (
-    "is a MATLAB object ({kind}), which only MATLAB can open; save its members as arrays, as `x.Data` and `x.Time`"
-)
-
-
+_OBJECT = "is a MATLAB object ({kind}), which only MATLAB can open; there, if it is x, {mend}"
+_MENDS = {
+    "timetable": "write it as CSV by writetimetable(x, 'x.csv')",
+    "table": "write it as CSV by writetable(x, 'x.csv')",
+    "datetime": "save seconds(x - x(1))",
+    "duration": "save seconds(x)",
+    "categorical": "save double(x)",
+}
+_MEND = "save its members as arrays, as x.Data and x.Time of a timeseries"
+_NAMELESS = "None"  # as SciPy names each object, whose own name is in its member `s0`
 _ONE = "choose one and save it alone"
 
 
@@ -78,7 +84,7 @@ def _scipy(path: Path) -> Mapping[str, Any]:
         raise damaged
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("error", "Duplicate variable name")
+        warnings.filterwarnings("error", f'Duplicate variable name (?!"{_NAMELESS}")')
         try:
             loaded = scipy.io.loadmat(path, simplify_cells=True)
         except scipy.io.matlab.MatReadWarning as error:
@@ -86,7 +92,18 @@ def _scipy(path: Path) -> Mapping[str, Any]:
         # SciPy raises these on damaged lengths and types.
         except (ArithmeticError, LookupError, MemoryError, TypeError, ValueError):
             raise damaged from None
-    return {name: value for name, value in loaded.items() if not name.startswith("__")}
+    variables = {name: value for name, value in loaded.items() if not name.startswith("__")}
+    if isinstance(variables.get(_NAMELESS), MatlabOpaque):
+        del variables[_NAMELESS]
+        variables |= _objects(path)
+    return variables
+
+
+def _objects(path: Path) -> dict[str, _Unusable]:
+    """Objects of a file by their own names."""
+    with path.open("rb") as file:
+        parts = [scipy.io.loadmat(part) for name, part in varmats_from_mat(file) if name == _NAMELESS]
+    return {bytes(part[_NAMELESS][0]["s0"]).decode(): _plain(part[_NAMELESS]) for part in parts}
 
 
 def _hdf5(path: Path) -> Mapping[str, Any]:
@@ -101,7 +118,7 @@ def _from_hdf5(item: Any) -> Any:
     kind = item.attrs.get("MATLAB_class", b"double")
     kind = kind.decode() if isinstance(kind, bytes) else str(kind)
     if "MATLAB_object_decode" in item.attrs and kind not in _NUMBERS:
-        return _Unusable(_OBJECT.format(kind=kind))
+        return _object(kind)
     if "MATLAB_sparse" in item.attrs:
         return _Unusable("is a sparse matrix; save full(…) of it")
     if isinstance(item, h5py.Group):
@@ -140,12 +157,16 @@ def _plain(value: Any) -> Any:
         return _Unusable("is complex; save its real part")
     if array.dtype.names is not None or type(value).__name__ in ("MatlabOpaque", "MatlabFunction", "MatlabObject"):
         kind = bytes(np.ravel(array)[0]["s2"]).decode() if array.dtype.names and "s2" in array.dtype.names else "class"
-        return _Unusable(_OBJECT.format(kind=kind))
+        return _object(kind)
     if array.dtype.kind == "c":
         return _Unusable("is complex; save its real part")
     if array.dtype.kind not in "biuf":
         return _Unusable("is text; name a variable of numbers")
     return array.astype(np.float64) if array.size else _Unusable("is empty")
+
+
+def _object(kind: str) -> _Unusable:
+    return _Unusable(_OBJECT.format(kind=kind, mend=_MENDS.get(kind, _MEND)))
 
 
 def _samples_first(array: np.ndarray) -> np.ndarray:

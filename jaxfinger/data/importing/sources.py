@@ -13,7 +13,7 @@ from jaxfinger.data.importing.dates import packed, texts
 from jaxfinger.data.importing.long_table import widened
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.opening import plain_reason
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, listed
 
 # Functions of pandas for tables that are not read here.
 _FRAMES = {
@@ -38,9 +38,13 @@ def load_recording(path: Path) -> Recording:
     """Load every numeric variable of a recording, and the reasons why others cannot be used. Dates are seconds.
 
     Raises:
-        UserError: the file is missing, empty, of an unknown kind, or damaged.
+        UserError: the file is missing, empty, of an unknown kind, damaged, or without numbers.
     """
-    return widened(_with_dates(_load(path)))
+    recording = widened(_with_dates(_load(path)))
+    if not recording.variables and recording.unusable:
+        said = listed([f"{name} {reason}" for name, reason in recording.unusable.items()], 1)
+        raise UserError(f"{path}: holds no variable of numbers: {said}")
+    return recording
 
 
 def _with_dates(recording: Recording) -> Recording:

@@ -15,6 +15,7 @@ from jaxfinger.data.importing.text_lines import Line
 from jaxfinger.errors import UserError, counted, listed
 
 _LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
+_HEX = re.compile(r"(0[xX])?[0-9A-Fa-f]+")
 _HOUR = re.compile(r"\d:\d\d")  # in a time of day or a date
 
 
@@ -82,12 +83,24 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: Dialect, numeri
     first = cells[bad[0]]
     if all(_LIST.match(cell) for cell in cells if cell):
         return _lists(cells)
+    if _is_hexadecimal(cells):
+        mend = "write them in decimal and with their sign; in Python int(x, 16) reads those without one"
+        return Column(None, f"holds numbers in hexadecimal ({first!r} in line {lines[bad[0]]}); {mend}")
     some_numbers = any(value is not None and not np.isnan(value) for value in known.values())
     if some_numbers or _HOUR.search(first) or ONE_GROUP.match(first):
         return Column(None, _fault(first, lines[bad[0]], len(bad) - 1))
     there = listed([repr(cell) for cell in dict.fromkeys(cells) if cell], 4)
     fault = f"holds the words {there}; a trial's `where` can test it"
     return Column(None, fault, np.array(cells, np.dtypes.StringDType()))
+
+
+def _is_hexadecimal(cells: Sequence[str]) -> bool:
+    """Whether cells are hexadecimal: behind 0x, or as many digits each with those from 0 to 9 among them."""
+    filled = [cell for cell in cells if cell]
+    if not all(map(_HEX.fullmatch, filled)):
+        return False
+    marked = all(cell[:2] in ("0x", "0X") for cell in filled)
+    return marked or (len({len(cell) for cell in filled}) == 1 and any(cell.isdecimal() for cell in filled))
 
 
 def _lists(cells: Sequence[str]) -> Column:

@@ -342,3 +342,26 @@ def test_units_may_stand_behind_a_stroke(tmp_path, name, units):
     found = load(tmp_path, f"x,{name}\n" + "1,2\n2,3\n3,4\n")
     assert found.variables[name].units == units
     assert without_units(name) == {"/hand/m": "hand/m", "a/b": "a/b"}.get(name, re.split(" ?/", name)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"),
+    [
+        ("log.log", "(170000{k}.5) can0 141#9C{k:04X}0000001100"),
+        ("log.txt", "  can0  141   [8]  9C {k:02X} 00 00 00 00 11 00"),
+        ("log.asc", "   {k}.0010 1  141             Rx   d 8 9C {k:02X} 00 00 00 00 11 00"),
+    ],
+    ids=["candump -l", "candump", "Vector"],
+)
+def test_frames_of_a_bus_are_told_how_to_be_written(tmp_path, name, frame):
+    with pytest.raises(UserError, match=f"{name}: holds frames of a CAN bus.* decode them"):
+        load(tmp_path, "\n".join(frame.format(k=k) for k in range(200)), name)
+
+
+@pytest.mark.parametrize("form", ["0x{:X}", "{:04X}"])
+def test_hexadecimal_numbers_are_no_words_and_no_powers_of_ten(tmp_path, form):
+    """12E4 is one of them."""
+    found = load(tmp_path, "t,enc\n" + "".join(f"{k / 100},{form.format(4000 + k)}\n" for k in range(1000)))
+    assert list(found.variables) == ["t"]
+    assert "enc" not in found.words
+    assert re.match(r"holds numbers in hexadecimal \('.*' in line \d+\); write them in decimal", found.unusable["enc"])
