@@ -14,6 +14,7 @@ from jaxfinger.data.importing.expressions import ExpressionError, evaluate
 from jaxfinger.data.importing.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
 from jaxfinger.data.importing.readings import compare_units, converted, is_slower, period
 from jaxfinger.data.importing.recording import Variable
+from jaxfinger.data.importing.rounding import evened
 from jaxfinger.data.importing.variables import Source, column_of, scale_of
 from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
@@ -95,7 +96,7 @@ def trial_clock(trial: MappedTrial, first: Column, source: Source, where: Place,
         )
     order = increasing_order(time[rows], f"`{reading.from_}`", trial.sort, _PARTS, place, report)
     rows, units = rows[order], reading.units or "s"
-    clock = Clock(time[rows], rows, len(time), source, reading.from_, units, trial.sort, begins_again)
+    clock = Clock(evened(time[rows]), rows, len(time), source, reading.from_, units, trial.sort, begins_again)
     return _cut(clock, trial, where, report)
 
 
@@ -304,7 +305,7 @@ class ColumnReader:
         present = present & _stamped(np.where(present, time, 0.0), own_name, where, self.report)
         time, values = time[present], values[present]
         order = increasing_order(time, own_name, clock.sort, _OWN_PARTS, where, self.report)
-        time, values = time[order], values[order]
+        time, values = evened(time[order]), values[order]
         onto = self._between if is_slower(time, np.isfinite(values)) else self._onto
         return onto(time, values, own_name, whole, where)
 

@@ -27,6 +27,7 @@ REST_SPEED_NOISE = 6.0  # times the noise of the speed: a slower joint may be at
 REST_SPEED_SHARES = 1e-3, 0.1
 STILL_SHARE = 0.1  # of the fastest motion of the trial: a stepped column that is slower is held.
 MIN_HOLD = 0.2  # s, at the protocol's pace: one length of the filter, 1/HOLD_CUTOFF_HZ, beside the blurred ends.
+ROUNDING = 1e-3  # of an interval: stamps are right to that, so that a sample at the edge of a hold is in it.
 # A ramp is at least this many blocks of 1/20 s long. Only the block in which a held tendon slips is uncertain, and in a
 # ramp that is a twentieth.
 RAMP_BLOCKS = 20
@@ -126,10 +127,10 @@ def find_holds(trial: Trial, pace: float = 1.0) -> Int[np.ndarray, " N"]:
     cutoff = fitting_cutoff(trial.time, HOLD_CUTOFF_HZ / pace)
     rate = np.abs(smooth_rate(trial.time, x, cutoff))
     still = rate < STILL_SHARE * np.nanpercentile(rate, 99) if np.isfinite(rate).any() else np.zeros(len(x), bool)
-    index = 0
+    index, rounding = 0, ROUNDING * median(np.diff(trial.time))
     for first, stop in stretches_of(still):
-        begin = trial.time[first] + (1.0 / cutoff if first > 0 else 0.0)
-        end = trial.time[stop - 1] - (1.0 / cutoff if stop < len(x) else 0.0)
+        begin = trial.time[first] + (1.0 / cutoff if first > 0 else 0.0) - rounding
+        end = trial.time[stop - 1] - (1.0 / cutoff if stop < len(x) else 0.0) + rounding
         if end - begin >= MIN_HOLD * pace:
             hold[(trial.time >= begin) & (trial.time <= end)] = index
             index += 1

@@ -39,6 +39,15 @@ def test_derived_holds_lie_inside_the_true_ones(session):
     assert (find_holds(session["07-VD.3"]) == -1).all()
 
 
+def test_rounding_moves_no_sample_out_of_a_hold(session):
+    """At 240 Hz, too, a filter's length is a whole number of samples."""
+    exact = replace(session["02-ID.3-static-PIP"], hold=None)
+    count = np.arange(len(exact.time))
+    of = [replace(exact, time=time) for time in (count / 240.0, np.round(count / 240.0, 7))]
+    assert find_holds(of[0]).max() > 0
+    np.testing.assert_array_equal(*map(find_holds, of))
+
+
 def test_a_column_that_never_turns_keeps_its_direction():
     x = np.linspace(0.0, 1.0, 50)[:, None] * [1.0, 0.0]
     sure = np.tile([1.0, 0.0], (50, 1))
