@@ -59,6 +59,7 @@ _SPELT |= {"second": "s", "seconds": "s", "days": "day", "newton": "N", "newtons
 _SPELT |= {"secs": "s", "sek": "s", "sekunden": "s", "minute": "min", "minutes": "min", "hour": "h", "hours": "h"}
 _SPELT |= {"millis": "ms", "msec": "ms", "msecs": "ms", "milliseconds": "ms"}
 _SPELT |= {"micros": "us", "usec": "us", "usecs": "us", "microseconds": "us", "nsec": "ns", "nanoseconds": "ns"}
+_NO_UNITS = "min", "in", "ft"  # at the end of a name: a lowest value, an input, a force-torque sensor
 # Words that are a unit in one language and another unit in others.
 EITHER = {"grad": "deg in German, gon in other languages"}
 # Units of other systems and of raw signals, without capitals and what joins factors: numbers in them are never in SI.
@@ -89,6 +90,25 @@ def stated_units(name: str) -> str:
     """Units that end a column's name, as it spells them; empty where none do."""
     in_brackets = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
     return in_brackets[1].strip() if in_brackets else (*_behind_a_stroke(name), "", "")[1]
+
+
+def spelt(name: str) -> str:
+    """Unit that ends a name such as `stamp_ms`, `force_kg` or `torque_N_mm`, as it is spelt there; empty without one.
+
+    No single letter is taken for one but the g of a force, nor words that have another meaning there.
+    """
+    *before, last = re.split(r"[\s_./]+", name.strip())
+    pair = f"{before[-1]} {last}" if len(before) > 1 else ""
+    if is_foreign(pair) or (unit_name(pair) and TO_SI[unit_name(pair)].si == "N m"):
+        return pair
+    of_force = last == "g" and re.match(r"f(_|orce)|load|tension", name.lower()) is not None
+    known = (len(last) > 1 and last not in _NO_UNITS and (unit_name(last) or is_foreign(last))) or of_force
+    return last if before and known else ""
+
+
+def spelt_unit(name: str) -> str:
+    """Unit that ends a name, as a mapping has it; empty where no mapping converts it."""
+    return unit_name(spelt(name))
 
 
 def _behind_a_stroke(name: str) -> tuple[str, ...]:

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from jaxfinger.data.importing.logs import Log
-from jaxfinger.data.importing.names import is_speed, spelt_unit
+from jaxfinger.data.importing.names import is_speed
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import quoted
-from jaxfinger.data.units import EITHER, TO_SI
+from jaxfinger.data.units import EITHER, TO_SI, spelt_unit
 from jaxfinger.errors import listed
 
 _MAX_SPEEDS = 4  # that are named

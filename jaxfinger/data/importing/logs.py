@@ -9,10 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxfinger.data.importing.names import spelt_unit
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.survey import ColumnSurvey
-from jaxfinger.data.units import TO_SI
+from jaxfinger.data.units import TO_SI, spelt_unit
 
 # Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
 # little apart.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxfinger.data.importing.columns import coarse_rate
-from jaxfinger.data.units import TO_SI, unit_name, weight_unit, without_units
+from jaxfinger.data.units import TO_SI, spelt_unit, unit_name, weight_unit, without_units
 
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
@@ -124,9 +124,3 @@ def is_joint(name: str, owners: Owners) -> bool:
 def is_set_point(name: str) -> bool:
     """Whether a variable's name, or that of a structure which holds it, says that it is a set-point."""
     return re.search(_SET_POINT, words(without_units(name).split("/")[-1])) is not None
-
-
-def spelt_unit(name: str) -> str:
-    """Unit at the end of a name such as `stamp_ms`. No single letter is taken for one, nor `min` of a lowest value."""
-    last = re.split(r"[\s_./]", name.strip())[-1]
-    return unit_name(last) if len(last) > 1 and last != "min" else ""

@@ -8,7 +8,7 @@ from jaxfinger.data.findings import Finding, Report
 from jaxfinger.data.importing.mapping import Reading
 from jaxfinger.data.importing.recording import Variable
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import TO_SI, is_foreign, unit_name, weight_unit
+from jaxfinger.data.units import TO_SI, is_foreign, spelt, unit_name, weight_unit
 from jaxfinger.errors import listed
 
 _MIN_VALUES = 30  # of a column: with fewer, values that are lost at random may look regular.
@@ -73,16 +73,17 @@ def compare_units(
     variable: Variable, spec: Reading, units: str, report: Report, where: Place, derived: bool = False
 ) -> None:
     """Warn where the recording, or the formula of a derived variable, has other units than the mapping."""
-    weight = weight_unit(variable.units) if units == "N" else ""
-    stated, mapped = unit_name(variable.units) or weight, spec.units or units
+    text = variable.units or ("" if derived else spelt(spec.from_))
+    weight = weight_unit(text) if units == "N" else ""
+    stated, mapped = unit_name(text) or weight, spec.units or units
     as_it_is = spec.scale in (1.0, -1.0)
     said = ""
     if stated and mapped in TO_SI and stated != mapped and as_it_is and TO_SI[stated] != TO_SI[mapped]:
         states = f"the formula of {spec.from_!r} gives" if derived else "the recording states"
-        said = f"{states} {variable.units}, and the mapping reads {mapped}; "
+        said = f"{states} {text}, and the mapping reads {mapped}; "
         said += f'write units = "{weight}"' if weight else "correct one of them"
-    elif is_foreign(variable.units) and not weight and mapped != "1" and as_it_is:
-        said = f"the recording states {variable.units}, and the mapping reads {mapped}"
-        said += f"; write `scale`, the {mapped} in one {variable.units}"
+    elif is_foreign(text) and not weight and mapped != "1" and as_it_is:
+        said = f"the recording states {text}, and the mapping reads {mapped}"
+        said += f"; write `scale`, the {mapped} in one {text}"
     if said and Finding("warning", where.key, said) not in report:  # Trials share columns.
         report.warning(where.key, said)

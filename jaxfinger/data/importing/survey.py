@@ -14,7 +14,7 @@ from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameles
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.mounting import reach_of, weight_of
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, is_unknown, without_units
+from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, is_unknown, spelt, without_units
 
 # Usual intervals of a clock that ticks evenly. A late sample makes one up to twice as long; in a longer one than this,
 # samples were lost. It decides what counts as the rate, not what is a fault (`signals.clock`).
@@ -109,7 +109,8 @@ def columns_of(
             angles = recording.angles if meaning == "q" and not (units or is_foreign(variable.units)) else ""
             units = units or angles
             stated = bool(units and (variable.units or angles))
-            foreign = variable.units if not units and _is_no_unit(variable.units, owners) else ""
+            text = variable.units or spelt(name)
+            foreign = text if not units and _is_no_unit(text, owners) else ""
             finite = x[np.isfinite(x)]
             whole = len(finite) > 0 and bool(np.all(finite == np.round(finite)) and np.ptp(finite) > 0.0)
             counts = whole and meaning in _MAX_VALUES and meaning != "temperature"
@@ -140,8 +141,8 @@ def _said(recording: Recording, owners: Owners) -> dict[tuple[str, int], tuple[s
     said = {}
     for name, variable in recording.variables.items():
         for k, x in enumerate(variable.values.reshape(len(variable.values), -1).T):
-            ratio = is_ratio(variable.units)
-            said[name, k] = ("", "") if ratio else meaning_of(name, _column(variable, k), x, variable.units, owners)
+            text = variable.units or spelt(name)
+            said[name, k] = ("", "") if is_ratio(text) else meaning_of(name, _column(variable, k), x, text, owners)
     if not any(channel == "q" for channel, _ in said.values()):
         for (name, k), (channel, units) in said.items():
             variable = recording.variables[name]

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxfinger.data.findings import Report
 from jaxfinger.data.importing.by_mapping import import_session
 from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
@@ -115,3 +116,34 @@ def test_an_open_unit_is_refused(tmp_path):
     )
     with pytest.raises(UserError, match=r"channels.q.MCP: has units that are still to be filled in"):
         import_session([path], mapping)
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "doubt"),
+    [
+        ("torque_N_mm", "N mm", ""),
+        ("torque_N_m", "N m", ""),
+        ("torque_kgf_cm", "?", "it states kgf cm"),
+        ("torque oz_in", "?", "it states oz in"),
+        ("force_kg", "kgf", ""),
+        ("force_g", "gf", ""),
+        ("force_mV", "?", "it states mV"),
+        ("angle_counts", "?", "it states counts"),
+        ("angle_in", "rad", ""),
+    ],
+)
+def test_a_unit_that_ends_a_name_is_read_or_asked_for(tmp_path, name, units, doubt):
+    path = log(tmp_path, f"time [s],{name}", SWEEP)
+    said = next(s for s in proposal([load_recording(path)]).splitlines() if f'from = "{name}"' in s)
+    assert f'units = "{units}"' in said
+    assert doubt in said
+
+
+def test_a_unit_that_ends_a_name_contradicts_a_mapping_with_another(tmp_path):
+    path, report = log(tmp_path, "t,q_rad,force_kg", SWEEP, 2.0 + SWEEP), Report()
+    (tmp_path / "m.toml").write_text(
+        ONE_JOINT + '[trials.a]\nexperiment = "VD.1"\ntime = "t"\nchannels.q.MCP = "q_rad"\n'
+        'channels.tendon_force.T1 = "force_kg"\n'
+    )
+    import_session([path], tmp_path / "m.toml", report)
+    assert 'states kg, and the mapping reads N; write units = "kgf"' in str([f.message for f in report])
