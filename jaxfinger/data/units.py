@@ -50,7 +50,7 @@ TO_SI = {
     "degC": Unit("K", 1.0, 273.15),
     "1": Unit("1", 1.0),
 }
-_SPELT = {"°": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
+_SPELT = {"°": "deg", "度": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
 _SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
 _SPELT |= {"revolution": "turn", "cycle": "turn", "cycles": "turn", "umdrehung": "turn", "umdrehungen": "turn"}

@@ -115,7 +115,8 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
     for name, q, (lower, upper), slides in columns:
         if slides or not np.isfinite(q).all():
             continue
-        low, high = quantile(q, 0.01), quantile(q, 0.99)
+        measured = q[q != placeholder(q)]
+        low, high = quantile(measured, 0.01), quantile(measured, 0.99)
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         outside = low < lower - _MAX_OVERTRAVEL or high > upper + _MAX_OVERTRAVEL
         turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, (lower, upper))

@@ -18,6 +18,7 @@ from jaxfinger.data.importing.rounding import evened
 from jaxfinger.data.importing.variables import Source, column_of, scale_of
 from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
+from jaxfinger.data.signals.unmeasured import placeholder
 from jaxfinger.data.toml import Place
 from jaxfinger.data.units import TO_SI, limits_of_turns, unit_name, whole_turns
 from jaxfinger.errors import UserError, counted, listed
@@ -254,7 +255,7 @@ class ColumnReader:
 
     def _refuse_turns(self, spec: ColumnSpec, x: Float[np.ndarray, " N"], limits: np.ndarray, where: Place) -> None:
         """Refuse an angle beyond a turn and the range of its limits in the recording's own units, which are right."""
-        low, high = np.nanquantile(x, (0.01, 0.99))
+        low, high = np.nanquantile(x[x != placeholder(x)], (0.01, 0.99))
         if max(-low, high) < 2.0 * np.pi or high - low < np.ptp(limits):
             return
         of = [(term, self._source(term, where).variable(term.from_, where)) for term in terms(spec)]

@@ -70,8 +70,10 @@ def load_csv(path: Path) -> Recording:
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
     names, units, scope = _names(above, dialect, len(numeric), blank=not any(row[-1] for row in rows))
     states = None if names else joint_states(rows, dialect.number)
-    if not names and states is None and first > 0 and len(split(body[first - 1].text)) != len(numeric):
-        given = counted(len(split(body[first - 1].text)), "column")
+    before = split(body[first - 1].text) if first > 0 else []
+    cut = all(dialect.number(cell) is not None for cell in before)  # Where a recording begins within a line.
+    if not names and states is None and first > 0 and not cut and len(before) != len(numeric):
+        given = counted(len(before), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     lost = sum(line.text.startswith(_LOST[0]) for line in lines)
     remarks = (f"says {counted(lost, 'time')} that messages were lost",) if lost else ()
@@ -134,7 +136,7 @@ def _holds_numbers(dialect: Dialect, cells: Sequence[str], numeric: Sequence[boo
     """Whether most of a line's cells are numbers where a sample has numbers."""
     values = _numbers(dialect, cells, numeric)
     count = sum(value is not None and not np.isnan(value) for value in values)
-    return len(cells) == len(numeric) and 2 * count > len(values)
+    return bool(cells) and 2 * count > len(values) and (len(cells) == len(numeric) or count == len(cells))
 
 
 def _names(
@@ -166,7 +168,10 @@ def _names(
     units = ("",) * width
     if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
-    return tuple(words[0]) if words else (), units, False
+    names = tuple(words[0]) if words else ()
+    if len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
+        names = tuple(".".join(filter(None, pair)) for pair in zip(words[1], names, strict=True))
+    return names, units, False
 
 
 def _is_unit(cell: str) -> bool:

@@ -32,6 +32,7 @@ _FORMS = tuple(
 )
 _EITHER = re.compile(r"(\d\d?)([-/])(\d\d?)\2(?:\d{4}|\d\d),? ")  # day or month first; with dots it is the day
 _PACKED = re.compile(r"(\d{14})(\d{3}|[.,]\d*)?")
+_DAY = 86400.0  # s
 _YEARS = 1970, 2099  # in which a packed date lies; other numbers of 14 digits are none
 _MAX_DISORDER = 0.1  # of a clock's steps that run back: late stamps, and midnight
 # Usual steps of a packed clock: from one minute to the next its number jumps by more than the first, and its time goes
@@ -196,4 +197,15 @@ def texts(cells: Collection[str]) -> Float[np.ndarray, " N"] | None:
     read = {cell: seconds(cell.strip(), months) for cell in set(cells) if cell.strip()}
     if not read or None in read.values():
         return None
-    return np.array([read.get(cell, np.nan) for cell in cells], np.float64)
+    return past_midnight(np.array([read.get(cell, np.nan) for cell in cells], np.float64))
+
+
+def past_midnight(times: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Times of day, s, that go on beyond a day where they pass midnight; dates as they are."""
+    filled = np.isfinite(times)
+    steps = np.diff(times[filled])
+    if not len(steps) or np.max(times[filled]) >= _DAY or not (steps < -0.5 * _DAY).any():
+        return times
+    out = times.copy()
+    out[filled] += _DAY * np.concatenate([[0.0], np.cumsum(steps < -0.5 * _DAY)])
+    return out

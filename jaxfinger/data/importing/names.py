@@ -12,17 +12,21 @@ from jaxfinger.data.units import TO_SI, spelt_unit, unit_name, weight_unit, with
 
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
 _MEANINGS = (
-    ("time", r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec|^duration$|^epoch|^elapsed|^utc"),
+    (
+        "time",
+        r"^t(_?(s|sec|ms|us|ns))?$|time|stamp|clock|zeit|^sec|^duration$|^epoch|^elapsed|^utc|^(milli|micro)s$"
+        r"|^temps$|^tiempo|^tempo$|[时時][间間]",
+    ),
     ("temperature", r"temp"),
-    ("joint_torque", r"(^|_)tau|torque|effort|moment|joint[_ ]?\d*[_ ]?force"),
+    ("joint_torque", r"(^|_)tau|torque|effort|moment|^couple|力矩|扭矩|トルク|joint[_ ]?\d*[_ ]?force"),
     ("tendon_excursion", r"excursion|^l\d*$|length|(?<![a-z])len(?![a-z])|pull|spool|linear|travel"),
     (
         "tendon_force",
         r"tension|tendon.*force|^f_?t|^f(\d|_(?!([xyz](_|\d|$)|tip$)))|cable|load[ _-]?cell|(^|_)cell(_|\d|$)"
-        r"|^force(?![ _-]?[xyz]$)",
+        r"|^force(?![ _-]?[xyz]$)|kraft$|^fuerza|^forza|[张張]力",
     ),
     ("fingertip_force", r"f?tip|contact|(?<![a-z])(f|force)[ _-]?[xyz]$|wrench"),
-    ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|deg$"),
+    ("q", r"^q[_\d]*|_q(_|\d|$)|angle|pos|enc|theta|winkel|[aá]ngulo|angolo|角度|deg$"),
 )
 # Of a clock's values or steps: more values differ, also out of order, or more steps go on, also of a recording that was
 # pasted twice.

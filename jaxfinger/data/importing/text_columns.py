@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfinger.data.importing.dates import is_packed_date, month_first, packed_texts, seconds
+from jaxfinger.data.importing.dates import is_packed_date, month_first, packed_texts, past_midnight, seconds
 from jaxfinger.data.importing.dialect import ONE_GROUP, Dialect, has_points
 from jaxfinger.data.importing.text_lines import Line
 from jaxfinger.errors import UserError, counted, listed
@@ -79,7 +79,8 @@ def _column(cells: Sequence[str], lines: Sequence[int], dialect: Dialect, numeri
             return Column(np.array(values, np.float64), units=unit)
         timed = any(seconds(cell) is not None for cell in known)
         read = f"has dates such as {either}, read with the {'month' if months else 'day'} first" if either else ""
-        return Column(np.array(values, np.float64), units="s" if timed else "", remark=read)
+        numbers = np.array(values, np.float64)
+        return Column(past_midnight(numbers) if timed else numbers, units="s" if timed else "", remark=read)
     first = cells[bad[0]]
     if all(_LIST.match(cell) for cell in cells if cell):
         return _lists(cells)
@@ -135,7 +136,7 @@ def _fault(cell: str, line: int, others: int) -> str:
         whole, part = re.split("[.,]", cell)
         read = f"which is {whole}.{part} or {whole}{part}"
         return f"holds {cell!r} in line {line}, {read}{more}; write it without thousands separators"
-    mend = "empty these cells where a value is missing, else write numbers" if others else "correct or drop that line"
+    mend = "drop these lines, or empty the cells where a value is missing" if others else "correct or drop that line"
     if _HOUR.search(cell):
         mend = "write seconds, or dates and times as 2026-01-31 12:00:00.000"
     return f"holds {cell!r} in line {line}, which is no number{more}; {mend}"

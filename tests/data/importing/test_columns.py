@@ -227,6 +227,19 @@ def test_an_angle_of_more_than_a_turn_in_stated_units_is_not_to_be_converted(tmp
     assert ("`limits_deg = [0, 720]` in the finger's file" in str(caught.value)) == bool(stated)
 
 
+def test_a_number_in_place_of_a_missing_angle_shows_no_turns(tmp_path):
+    """Two samples in a hundred are -9999 degrees."""
+    degrees = np.where(np.arange(len(Q)) % 50, np.degrees(Q), -9999.0)
+    table = np.column_stack([TIME, degrees, 0.01 * np.sin(TIME)])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t,position [deg],tau", comments="")
+    text = MAPPING.replace("EXTRA", "").replace("TORQUE", '"tau"').replace("log.mat", "log.csv")
+    text = text.replace('MCP = "q"', 'MCP = { from = "position [deg]", units = "deg" }')
+    (tmp_path / "m.toml").write_text(text)
+    report = Report()
+    import_file([tmp_path / "log.csv"], tmp_path / "m.toml", tmp_path / "s.h5", True, report)
+    assert any("as where a number stands for a missing value" in finding.message for finding in report)
+
+
 def test_the_start_of_a_span_is_the_first_sample(tmp_path):
     trial, _ = bring_in(tmp_path, '"now"', "span = [1.0, 3.0]", t=TIME + 1.7e9)
     np.testing.assert_allclose(trial.q[:, 0], Q[100:300])

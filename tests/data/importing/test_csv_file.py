@@ -365,3 +365,16 @@ def test_hexadecimal_numbers_are_no_words_and_no_powers_of_ten(tmp_path, form):
     assert list(found.variables) == ["t"]
     assert "enc" not in found.words
     assert re.match(r"holds numbers in hexadecimal \('.*' in line \d+\); write them in decimal", found.unusable["enc"])
+
+
+def test_names_below_those_of_groups_are_joined(tmp_path):
+    """As pandas writes two levels of columns."""
+    found = load(tmp_path, ",MCP,MCP,PIP,PIP\n,q,tau,q,tau\n" + "".join(f"{k / 100},{k}.5,1,2,3\n" for k in range(20)))
+    assert list(found.variables) == ["column 0", "MCP.q", "MCP.tau", "PIP.q", "PIP.tau"]
+
+
+def test_a_recording_that_begins_within_a_line_has_no_names(tmp_path):
+    """As a serial monitor that is opened while a board sends."""
+    found = load(tmp_path, ".51,2.0\n" + "".join(f"{k * 1000},{k}.5,2.0\n" for k in range(20)))
+    assert list(found.variables) == ["column 0", "column 1", "column 2"]
+    assert found.remarks == ("has numbers in line 1 above its first whole sample, which are left out",)

@@ -154,3 +154,11 @@ def test_a_date_that_is_none_is_named_with_its_line(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("t,q\n" + "".join(f"2026/01/31 11:59:0{k},{k}\n" for k in range(9)) + "2026/02/31 11:59:09,9\n")
     assert "holds '2026/02/31 11:59:09' in line 11, which is no number" in load_recording(path).unusable["t"]
+
+
+def test_times_of_day_go_on_after_midnight(tmp_path):
+    path, count = tmp_path / "log.csv", np.arange(4000)
+    times = 86390.0 + count / 100.0
+    rows = [f"{t // 3600 % 24:02.0f}:{t // 60 % 60:02.0f}:{t % 60:05.2f},{k % 7}" for k, t in enumerate(times.tolist())]
+    path.write_text("t,q\n" + "\n".join(rows) + "\n")
+    np.testing.assert_allclose(stamps(path), count / 100.0, atol=1e-9)

@@ -89,3 +89,21 @@ def test_a_clock_shows_by_its_units_where_no_name_says_so(tmp_path, name, stated
     )
     assert clocks_of(late, columns_of(late)) == []
     assert seen(tmp_path, {"F_min": MOVED})["F_min"] == ("tendon_force", "N")
+
+
+@pytest.mark.parametrize(
+    ("name", "channel"),
+    [
+        ("millis", "time"),
+        ("Temps", "time"),
+        ("Zeit", "time"),
+        ("时间", "time"),
+        ("ángulo", "q"),
+        ("角度", "q"),
+        ("Couple", "joint_torque"),
+        ("トルク", "joint_torque"),
+        ("Seilkraft", "tendon_force"),
+    ],
+)
+def test_names_may_be_in_other_languages(tmp_path, name, channel):
+    assert seen(tmp_path, {name: TIME})[name][0] == channel
