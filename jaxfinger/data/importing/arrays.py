@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
@@ -12,6 +13,7 @@ import numpy as np
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.opening import why_closed, why_unreadable
 from jaxfinger.data.schema import FORMAT
+from jaxfinger.data.units import stated_units
 from jaxfinger.errors import UserError, listed
 
 _NANOSECONDS = {"M": "datetime64[ns]", "m": "timedelta64[ns]"}
@@ -69,7 +71,15 @@ def load_hdf5(path: Path) -> Recording:
     with h5py.File(path, "r") as file:
         if file.attrs.get("format") == FORMAT:
             raise UserError(f"{path}: is a session already; look at it with: jaxfinger check {path}")
-        return named_arrays(path, list(_datasets(file, "")))
+        units: dict[str, str] = {}
+        file.visititems(lambda name, item: units.update({name.replace("/", "."): _attribute(item)}))
+        return named_arrays(path, list(_datasets(file, "")), units)
+
+
+def _attribute(item: h5py.Group | h5py.Dataset) -> str:
+    """Unit that an attribute of a dataset states; empty where none does."""
+    stated = next((value for name, value in item.attrs.items() if name.lower() in ("unit", "units")), "")
+    return stated.decode(errors="replace") if isinstance(stated, bytes) else str(stated)
 
 
 def _datasets(group: h5py.Group, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -87,8 +97,12 @@ def _datasets(group: h5py.Group, prefix: str) -> Iterator[tuple[str, Any]]:
                 yield from _fields(name, item[()])
 
 
-def named_arrays(path: Path, leaves: Iterable[tuple[str, Any]]) -> Recording:
+def named_arrays(
+    path: Path, leaves: Iterable[tuple[str, Any]], units: Mapping[str, str] = MappingProxyType({})
+) -> Recording:
     """Recording of values by name: arrays, or lists of numbers or texts, samples first.
+
+    `units` are those that the file states beside the names; others may end the names, as in `q [deg]`.
 
     Raises:
         UserError: a name occurs twice.
@@ -108,7 +122,7 @@ def named_arrays(path: Path, leaves: Iterable[tuple[str, Any]]) -> Recording:
             if array.ndim == 1:
                 words[name] = array.astype(np.dtypes.StringDType())
         else:
-            variables[name] = Variable(array)
+            variables[name] = Variable(array, units=units.get(name) or stated_units(name))
     return Recording(path, variables, unusable, words=words)
 
 

@@ -71,8 +71,10 @@ def load_csv(path: Path) -> Recording:
     names, units, scope = _names(above, dialect, len(numeric), blank=not any(row[-1] for row in rows))
     states = None if names else joint_states(rows, dialect.number)
     before = split(body[first - 1].text) if first > 0 else []
-    cut = all(dialect.number(cell) is not None for cell in before)  # Where a recording begins within a line.
-    if not names and states is None and first > 0 and not cut and len(before) != len(numeric):
+    # A recording may begin within a line, or after a message of the board.
+    cut = all(dialect.number(cell) is not None for cell in before)
+    message = len(before) == 1 and len(body) - first > 1 and len(re.split(r"[\s,;]+", before[0])) != len(numeric)
+    if not names and states is None and not cut and not message and len(before) != len(numeric):
         given = counted(len(before), "column")
         raise UserError(f"{path}: names {given} and holds {len(numeric)}; give each column one name")
     lost = sum(line.text.startswith(_LOST[0]) for line in lines)
@@ -136,7 +138,7 @@ def _holds_numbers(dialect: Dialect, cells: Sequence[str], numeric: Sequence[boo
     """Whether most of a line's cells are numbers where a sample has numbers."""
     values = _numbers(dialect, cells, numeric)
     count = sum(value is not None and not np.isnan(value) for value in values)
-    return bool(cells) and 2 * count > len(values) and (len(cells) == len(numeric) or count == len(cells))
+    return values[:1] != [None] and 2 * count > len(values) and (len(cells) == len(numeric) or count == len(cells))
 
 
 def _names(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,9 @@ from typing import Any
 from jaxfinger.data.importing.arrays import named_arrays
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.errors import UserError
+
+_UNITS = "unit", "units"  # names of members that state units
+_VALUES = "value", "values", "data", "samples", "y"  # and of those beside them that are in these
 
 
 def load_json(path: Path) -> Recording:
@@ -24,7 +27,8 @@ def load_json(path: Path) -> Recording:
     """
     text = path.read_text(encoding="utf-8-sig")
     if path.suffix.lower() == ".json" and not _is_object_in_each_line(text):
-        return named_arrays(path, _leaves(_parsed(path, text, 1), ""))
+        leaves = list(_leaves(_parsed(path, text, 1), ""))
+        return named_arrays(path, leaves, _stated_units(leaves))
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     remarks = ()
     if len(lines) > 1 and not lines[-1][1].rstrip().endswith(("}", "]")):
@@ -46,6 +50,18 @@ def _parsed(path: Path, text: str, first: int) -> Any:
     except json.JSONDecodeError as error:
         where = f"line {first + error.lineno - 1}, column {error.colno}"
         raise UserError(f"{path}: is no JSON ({error.msg}, {where}); export the recording again") from None
+
+
+def _stated_units(leaves: Sequence[tuple[str, Any]]) -> dict[str, str]:
+    """Units by variable, as in `{"angle": {"values": […], "unit": "deg"}}` or `{"q": […], "units": {"q": "deg"}}`."""
+    units = {}
+    for name, value in leaves:
+        *outer, last = name.split(".")
+        if isinstance(value, str) and last in _UNITS:
+            units |= {".".join([*outer, values]): value for values in _VALUES}
+        elif isinstance(value, str) and outer[-1:] and outer[-1] in _UNITS:
+            units[".".join([*outer[:-1], last])] = value
+    return units
 
 
 def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:

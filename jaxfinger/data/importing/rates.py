@@ -29,7 +29,8 @@ def compare_rate(rate: float, clock: Clock, recording: Recording, where: Place, 
         steps = np.diff(time) / np.diff(clock.rows)
         usual, mean = float(np.median(steps)), float((time[-1] - time[0]) / (clock.rows[-1] - clock.rows[0]))
         # Coarse stamps have no usual step, and gaps lengthen the mean one.
-        agrees = [any(abs(np.log(rate * step * f)) < _MAX_ERROR for step in (usual, mean) if step) for f in factors]
+        error = _MAX_ERROR if usual else _MAX_ERROR + float(steps.max() / mean) / len(steps)
+        agrees = [any(abs(np.log(rate * step * f)) < error for step in (usual, mean) if step) for f in factors]
         mend = f"name it as `time` in place of rate_hz = {rate:g}"
         gaps = (steps > MIN_GAP * usual) & (usual > 0.0)
         if not any(agrees):

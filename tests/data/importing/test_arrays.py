@@ -138,3 +138,19 @@ def test_json_as_pandas_and_loggers_write_it(tmp_path, name, text):
     np.testing.assert_array_equal(found.variables["t"].values, [0.0, 0.1, 0.2])
     np.testing.assert_array_equal(found.variables["q"].values, [1.0, np.nan, 3.0])
     assert found.remarks == (("its last line is cut short and is left out",) if text.endswith("q") else ())
+
+
+def test_units_are_read_where_hdf5_and_json_state_them(tmp_path):
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["adc/angle"], file["adc/t_us"] = np.arange(5.0), np.arange(5.0)
+        file["adc/angle"].attrs["units"] = "mrad"
+    found = load_recording(tmp_path / "log.h5").variables
+    assert {name: variable.units for name, variable in found.items()} == {"adc.angle": "mrad", "adc.t_us": ""}
+    content = {
+        "angle": {"values": [1, 2, 3], "unit": "deg"},
+        "run": {"tau": [1, 2, 3], "t": [1, 2, 3], "units": {"tau": "N mm"}},
+        "force [mN]": [1, 2, 3],
+    }
+    found = written(tmp_path / "log.json", json.dumps(content)).variables
+    units = {name: variable.units for name, variable in found.items()}
+    assert units == {"angle.values": "deg", "run.tau": "N mm", "run.t": "", "force [mN]": "mN"}

@@ -378,3 +378,17 @@ def test_a_recording_that_begins_within_a_line_has_no_names(tmp_path):
     found = load(tmp_path, ".51,2.0\n" + "".join(f"{k * 1000},{k}.5,2.0\n" for k in range(20)))
     assert list(found.variables) == ["column 0", "column 1", "column 2"]
     assert found.remarks == ("has numbers in line 1 above its first whole sample, which are left out",)
+
+
+def test_a_message_above_the_numbers_is_no_name(tmp_path):
+    """One above numbers that are as many as its words may be their names, separated in another way."""
+    rows = "".join(f"{k}\t{k}.5\t2.0\n" for k in range(20))
+    assert list(load(tmp_path, "Ready.\nCalibrating...\n" + rows).variables) == ["column 0", "column 1", "column 2"]
+    with pytest.raises(UserError, match="names 1 column and holds 3"):
+        load(tmp_path, "t q tau\n" + rows)
+
+
+def test_counts_in_a_header_are_no_samples(tmp_path):
+    """As in LabVIEW's files."""
+    header = "Channels\t2\t\nSamples\t100\t100\nX_Value\tAngle\tTorque\n"
+    assert load(tmp_path, header + "".join(f"{k}\t{k}.5\t2.0\n" for k in range(20))).remarks == ()
