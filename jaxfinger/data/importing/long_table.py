@@ -114,7 +114,9 @@ def _takes_turns(x: np.ndarray) -> bool:
     if x.ndim > 1 or not np.all(x == np.round(x)):
         return False
     period = len(np.unique(x))
-    return 1 < period <= _MAX_LABELS < len(x) and bool(np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC)
+    if not 1 < period <= _MAX_LABELS < len(x):
+        return False
+    return bool(np.mean(x[1:] != x[:-1]) > _MIN_CHANGES and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC)
 
 
 def _is_clock(name: str, variable: Variable) -> bool:

@@ -112,9 +112,10 @@ def test_units_in_a_column_of_their_own(tmp_path):
     ("header", "label"),
     [
         ("time,phase,angle", lambda k: "up" if k < 300 else "down"),
+        ("time,tendon,angle", lambda k: 1 + k // 300),
         ("time,joint,angle", lambda k: 10 + k % 7 * (k // 50)),
     ],
-    ids=["phases", "whole degrees"],
+    ids=["phases", "tendons pulled one after another", "whole degrees"],
 )
 def test_a_wide_table_stays_as_it_is(tmp_path, header, label):
     table = [(t, label(k), a) for k, (t, a) in enumerate(zip(TIME, ANGLE, strict=True))]
