@@ -43,9 +43,9 @@ def test_rounding_moves_no_sample_out_of_a_hold(session):
     """At 240 Hz, too, a filter's length is a whole number of samples."""
     exact = replace(session["02-ID.3-static-PIP"], hold=None)
     count = np.arange(len(exact.time))
-    of = [replace(exact, time=time) for time in (count / 240.0, np.round(count / 240.0, 7))]
-    assert find_holds(of[0]).max() > 0
-    np.testing.assert_array_equal(*map(find_holds, of))
+    found, rounded = (find_holds(replace(exact, time=time)) for time in (count / 240.0, np.round(count / 240.0, 7)))
+    assert found.max() > 0
+    np.testing.assert_array_equal(rounded, found)
 
 
 def test_a_column_that_never_turns_keeps_its_direction():
