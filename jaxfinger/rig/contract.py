@@ -92,7 +92,7 @@ BENCH = np.dtype(
 )
 FAULTS = (  # faults that the stand-in injects on request; `simulated.faults` describes each
     "none", "nan", "freeze", "spike", "flag", "flicker", "clock-back", "clock-frozen", "clock-rate", "clock-jump",
-    "slow", "stall", "restart", "cut", "delay", "deaf", "state",
+    "slow", "stall", "restart", "cut", "delay", "deaf", "state", "mute",
 )  # fmt: skip
 
 SYMBOLS: dict[str, tuple[np.dtype, int]] = {  # name: (type of one element, number of elements)

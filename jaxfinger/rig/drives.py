@@ -8,6 +8,7 @@ from anywhere, says so at once, and takes no Enter until the tendon no longer pu
 from __future__ import annotations
 
 import time
+from typing import NoReturn
 
 from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import Setup
@@ -57,7 +58,9 @@ class Drives:
             self._clear_stop()
         if (state := rig.status().state) is not State.IDLE:
             raise UserError(f"nothing was armed: the controller is in state {state.name}, not IDLE; see its program.")
-        self._refuse_unready()  # Before a prompt has hands at the finger.
+        self._await_quiet()
+        if still := self._pulled():  # Before a prompt has hands at the finger.
+            self._refuse(still)
         self.course.drives_are_off()
         straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
         self.prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
@@ -78,18 +81,22 @@ class Drives:
         """
         if not setup.hand and self.course.drives_on:
             self.switch_off()
-        if self.rig.prepare(setup):
+        by_itself = self.rig.prepare(setup)
+        if by_itself:
             at_pose, ordered = AtPose(self.rig.description, setup), self.rig.status().head
             self.course.wait("finger being prepared", lambda b: int(b.seq[-1]) >= ordered and at_pose(b), 60.0)
         else:
             self._ask_until_fixed(setup)
-        if not setup.hand:
-            self._switch_on()
+        while not setup.hand and not self._switched_on(refuse_pull=by_itself):
+            self._stop_pull()
+            self._ask_until_fixed(setup)
 
-    def _switch_on(self) -> None:
+    def _switched_on(self, refuse_pull: bool) -> bool:
         """Arm the rig once the log has taken a frame and the rig is ready.
 
-        The disk may have failed while nothing was written, as during a prompt.
+        The disk may have failed while nothing was written, as during a prompt. A tendon that has begun to pull since
+        Enter arms nothing either: a hand may still be at the finger, or back at it. Return False then, or with
+        `refuse_pull` raise.
 
         Raises:
             UserError: something is wrong; nothing was armed.
@@ -97,17 +104,20 @@ class Drives:
         self.reader.note("arm", "the drives are to be switched on")
         if failed := self.reader.recorder.lacks(self.course.host_limit(self.rig.description.deadlines.disk_s)):
             raise TrialEnded(f"nothing was armed: {failed}; make room on the disk, or mend it", Trip.RECORDER)
-        self._refuse_unready()
+        self._await_quiet()
+        if still := self._pulled():
+            if refuse_pull:
+                self._refuse(still)
+            return False
         self.course.drives_go_on()
         self.course.sent(self.rig.arm)
+        return True
 
-    def _refuse_unready(self) -> None:
-        """Wait for samples from now on, and for QUIET_S of them without a violation; see that no tendon pulls.
-
-        The drives are off.
+    def _await_quiet(self) -> None:
+        """Wait for samples from now on, and for QUIET_S of them without a violation. The drives are off.
 
         Raises:
-            UserError: such samples did not come, or a tendon pulls; nothing was armed.
+            UserError: such samples did not come; nothing was armed.
         """
         reader, rig, head = self.reader, self.rig.description, self.rig.status().head
 
@@ -120,9 +130,11 @@ class Drives:
             bad = reader.unarmed_violation
             what = bad.sentence if bad is not None else "too few samples came"
             raise UserError(f"nothing was armed: {what}.")
-        if still := self._pulled():
-            mend = "free the tendon, or see its load cell and its offset"
-            raise UserError(f"nothing was armed: with the drives off {still}; {mend}.")
+
+    def _refuse(self, pull: str) -> NoReturn:
+        """Raise UserError, since a tendon pulls although the drives are off; `pull` says which."""
+        mend = "free the tendon, or see its load cell and its offset"
+        raise UserError(f"nothing was armed: with the drives off {pull}; {mend}.")
 
     def switch_off(self) -> None:
         """Release the finger, and see that the drives are off and no tendon pulls.

@@ -159,6 +159,7 @@ MATRIX = (
     Row("lag", "samples reach the host too late", HOST, (Trip.LAG, Trip.HEARTBEAT), wire="delay=0.2",
         shows=_deadline("lag_s")),
     Row("key", "stop key, also while the terminal takes no output", HOST, (Trip.OPERATOR,), wire="key"),
+    Row("mute", "stop key while a call to the controller waits for its answer", HOST, (Trip.OPERATOR,), wire="mute"),
     Row("deaf", "stop key, and the controller ignores STOP", CONTROLLER, (Trip.HEARTBEAT,), wire="deaf"),
     Row("reader", "the thread that reads and supervises hangs", HOST, (Trip.HOST, Trip.HEARTBEAT), wire="reader",
         shows=_deadline("thread_s")),

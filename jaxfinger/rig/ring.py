@@ -73,12 +73,18 @@ class RingRig(Rig):
         """Open the connection."""
 
     @abstractmethod
-    def _read(self, symbol: str, offset: int, size: int) -> bytes:
-        """Read `size` bytes of a symbol from `offset` on. Raises ConnectionLost."""
+    def _read(self, symbol: str, offset: int, size: int, urgent: bool = False) -> bytes:
+        """Read `size` bytes of a symbol from `offset` on. What is `urgent` overtakes other calls.
+
+        Raises ConnectionLost.
+        """
 
     @abstractmethod
-    def _write(self, symbol: str, data: bytes, mend: bool = True) -> None:
-        """Write a whole symbol. With `mend`, a lost connection is first opened again. Raises ConnectionLost."""
+    def _write(self, symbol: str, data: bytes, mend: bool = True, urgent: bool = False) -> None:
+        """Write a whole symbol. With `mend`, a lost connection is first opened again; `urgent` is as for `_read`.
+
+        Raises ConnectionLost.
+        """
 
     @abstractmethod
     def _sizes(self) -> dict[str, int]:
@@ -306,14 +312,15 @@ class RingRig(Rig):
         """
         if self._unheeded is not None and kind is not Kind.STOP:
             raise CommandRefused(f"{kind.name} gave way to a stop.")
-        self._id = number = (self._id + 1) % 2**32
+        self._id, urgent = (self._id + 1) % 2**32, kind is Kind.STOP
+        number = self._id
         order = np.zeros((), contract.COMMAND)
         order["id"], order["kind"], order["index"] = number, kind, index
         order["rate"], order["acceleration"] = rate, acceleration
         order["target"] = np.nan if target is None else target
-        self._write("stCommand", order.tobytes())
+        self._write("stCommand", order.tobytes(), urgent=urgent)
         deadline, asked = time.monotonic() + self.answer_s, 0.0
-        while int((status := self._status())["acknowledged"]) != number:
+        while int((status := self._status(urgent))["acknowledged"]) != number:
             self.report_alive()
             if self._id != number and kind is not Kind.STOP:
                 raise CommandRefused(f"{kind.name} gave way to a stop.")
@@ -325,7 +332,7 @@ class RingRig(Rig):
                     self._write("stCommand", order.tobytes())
                 raise ConnectionLost(f"the controller did not acknowledge {kind.name} within {self.answer_s:g} s.")
             if kind is Kind.STOP:
-                self._write("stCommand", order.tobytes())
+                self._write("stCommand", order.tobytes(), urgent=True)
             self._pause(0.002)
         if reason := int(status["refused"]):
             state = _known(State, int(status["state"]), "state").name
@@ -334,11 +341,11 @@ class RingRig(Rig):
         return number
 
     # states -----------------------------------------------------------------------------------------------------
-    def _record(self, symbol: str, dtype: np.dtype) -> np.void:
-        return np.frombuffer(self._read(symbol, 0, dtype.itemsize), dtype)[0]
+    def _record(self, symbol: str, dtype: np.dtype, urgent: bool = False) -> np.void:
+        return np.frombuffer(self._read(symbol, 0, dtype.itemsize, urgent), dtype)[0]
 
-    def _status(self) -> np.void:
-        return self._record("stStatus", contract.STATUS)
+    def _status(self, urgent: bool = False) -> np.void:
+        return self._record("stStatus", contract.STATUS, urgent)
 
     def status(self) -> Status:
         record = self._status()

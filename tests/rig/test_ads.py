@@ -18,7 +18,7 @@ import pytest
 
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
-from jaxfinger.rig import parse_plan, parse_rig, runner
+from jaxfinger.rig import contract, parse_plan, parse_rig, runner
 from jaxfinger.rig.backend import (
     CommandRefused,
     ConnectionLost,
@@ -28,6 +28,7 @@ from jaxfinger.rig.backend import (
     StaleRig,
     TensionRamp,
 )
+from jaxfinger.rig.backends import ads
 from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.ams import AmsServer
@@ -220,12 +221,66 @@ def test_nobody_there(tmp_path):
         pass
 
 
+def test_stop_overtakes_a_call_whose_answer_does_not_come(real_time, monkeypatch):
+    """The call would wait for 4 s. The stand-in's own watchdog is at 5 s, so it is STOP that releases the finger."""
+    monkeypatch.setattr(ads, "TIMEOUT_MS", 4000)
+    with ads_rig(real_time) as rig:
+        rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.2)))
+        rig.arm()
+        rig.inject("mute")
+        answered = threading.Event()
+
+        def read():
+            with contextlib.suppress(ConnectionLost):
+                rig._read("aRing", 0, contract.SAMPLE.itemsize)
+            answered.set()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        while not rig._lock.locked():
+            time.sleep(0.001)
+        time.sleep(0.1)
+        before = int(np.frombuffer(rig._read("stStatus", 0, 56, urgent=True), contract.STATUS)["head"][0])
+        rig.stop(Trip.OPERATOR)
+        assert not answered.is_set()
+        record = np.frombuffer(rig._read("stStatus", 0, 56, urgent=True), contract.STATUS)[0]
+        assert record["state"] == State.TRIPPED
+        assert record["trip"] == Trip.OPERATOR
+        assert record["trip_seq"] - before < 400  # samples of 1 ms; it takes a few where the machine is free
+        rig._given_up = True  # Or it would connect again, and wait as long once more.
+        reader.join()
+
+
+@pytest.mark.parametrize("fails", ["port", "connection"])
+def test_where_the_port_of_stop_fails_nothing_is_armed_and_stop_takes_its_turn(real_time, fails):
+    with ads_rig(real_time) as rig:
+        rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.2)))
+        if fails == "port":
+            pyads.pyads_ex.adsPortCloseEx(rig._stop_port)
+            with pytest.raises(ConnectionLost, match="nothing was armed: STOP would not reach the controller at once"):
+                rig.arm()
+            assert rig.status().state is State.IDLE
+        else:
+            rig.arm()
+            rig.inject("cut")
+        rig.stop(Trip.OPERATOR)
+        assert rig.status().trip is Trip.OPERATOR
+
+
+def test_stop_has_its_port_again_after_a_cut(real_time):
+    with ads_rig(real_time) as rig:
+        rig.inject("cut")
+        collect(rig, 100)
+        assert rig.reconnects >= 1
+        assert rig._call_at_once(rig._reading("stStatus", 0, 56))
+
+
 @pytest.mark.parametrize("calls", [1, 8])
 def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
     """The calls are another thread's; this thread waits for the connection."""
     rig, begun = ads_rig("127.0.0.1:1"), threading.Event()
 
-    def work():
+    def work(port):
         begun.set()
         time.sleep(1.6 / calls)
         return b""
@@ -236,9 +291,9 @@ def test_one_call_that_never_ends_hangs_and_many_slow_ones_do_not(calls):
     try:
         if calls == 1:
             with pytest.raises(ConnectionLost, match="hangs"):
-                rig._call(lambda: b"")
+                rig._call(lambda port: b"")
         else:
-            assert rig._call(lambda: b"mine") == b"mine"
+            assert rig._call(lambda port: b"mine") == b"mine"
     finally:
         other.join()
 
@@ -248,12 +303,12 @@ def test_a_call_that_hangs_is_waited_for_once(monkeypatch, hangs):
     """A stop, the look whether tension falls, and the end of the run would each wait for it again."""
     rig, begun, go = ads_rig("127.0.0.1:1"), threading.Event(), threading.Event()
 
-    def hang():
+    def hang(port=0):
         begun.set()
         go.wait(60.0)
         return b""
 
-    def cut():
+    def cut(port):
         raise pyads.ADSError(text="cut")
 
     monkeypatch.setattr(rig, "_attach", hang)
@@ -267,14 +322,14 @@ def test_a_call_that_hangs_is_waited_for_once(monkeypatch, hangs):
     try:
         begun.wait()
         with pytest.raises(ConnectionLost, match="hangs"):
-            rig._call(lambda: b"")
+            rig._call(lambda port: b"")
         attempts = []
         wait = rig._lock.acquire
         rig._lock = SimpleNamespace(
             acquire=lambda timeout: attempts.append(timeout) or wait(timeout=timeout), release=rig._lock.release
         )
         with pytest.raises(ConnectionLost, match="hangs"):
-            rig._call(lambda: b"")
+            rig._call(lambda port: b"")
         rig.close()
         assert len(attempts) == 2
     finally:

@@ -311,6 +311,39 @@ class Handy(Away):
             super().ask(text, keep_waiting)
 
 
+def test_a_hand_that_pulls_a_tendon_right_after_enter_is_asked_away(rig, record):
+    """The drives are still off. Nothing is armed, the same prompt comes again, and no trial is lost."""
+    machine = SimulatedRig(rig)
+    person, armed, arm = Away(machine, "nothing"), [], machine.arm
+
+    def touch():
+        if not person.pulled:
+            person.pulled = True
+            machine.inject("spike", slot(machine, "tension", "T3"), amount=6.0)
+
+    def count():
+        armed.append(bool(machine.controller.faults))
+        return arm()
+
+    person.pulled, machine.arm = False, count
+    after_answer(person, "Couple the external motor", touch)
+    ask = person.ask
+
+    def let_go(text, keep_waiting):
+        if "HANDS AWAY" in text:
+            machine.controller.faults.clear()
+            assert all(keep_waiting() for _ in range(4))
+        ask(text, keep_waiting)
+
+    person.ask = let_go
+    outcome = record(machine, operator=person)
+    assert outcome.cause == ""
+    assert outcome.complete == ("01-ID.2-DIP", "02-ID.4-T3-MCP")
+    at = next(i for i, text in enumerate(person.prompts) if "HANDS AWAY" in text)
+    assert person.prompts[at + 1] == person.prompts[at - 1]
+    assert not any(armed)
+
+
 @pytest.mark.parametrize("pull", [6.0, -6.0])
 @pytest.mark.parametrize("looks", [1, 20], ids=["Enter at once", "no Enter"])
 def test_a_tendon_that_begins_to_pull_while_hands_are_at_the_finger(rig, record, looks, pull):

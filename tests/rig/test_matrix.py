@@ -65,7 +65,7 @@ def test_the_documents_table_is_the_matrix(rig, results):
 
 # One phase and one pause between reads for each row; a pause of 1 ms gives blocks of a sample or two. Always tried are
 # the connection and the operator; the others are long tests.
-CELLS = [Cell("cut"), Cell("key", "ramp")]
+CELLS = [Cell("cut"), Cell("key", "ramp"), Cell("mute")]
 LONG_CELLS = [
     Cell("reader"), Cell("runner"), Cell("watch"), Cell("full"), Cell("disk"), Cell("stall"), Cell("call"),
     Cell("beat"), Cell("deaf"), Cell("lag"), Cell("slow"), Cell("restart"), Cell("flicker", "ramp", 0.001),

@@ -38,11 +38,11 @@ class SimulatedRig(RingRig):
     def close(self) -> None:
         pass
 
-    def _read(self, symbol: str, offset: int, size: int) -> bytes:
+    def _read(self, symbol: str, offset: int, size: int, urgent: bool = False) -> bytes:
         at = self.controller.place[symbol][0] + offset
         return bytes(self.controller.memory[at : at + size])
 
-    def _write(self, symbol: str, data: bytes, mend: bool = True) -> None:
+    def _write(self, symbol: str, data: bytes, mend: bool = True, urgent: bool = False) -> None:
         at = self.controller.place[symbol][0]
         self.controller.memory[at : at + len(data)] = data
 

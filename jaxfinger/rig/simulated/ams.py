@@ -30,8 +30,8 @@ OK, UNKNOWN_SERVICE, INVALID_GROUP, INVALID_OFFSET, INVALID_SIZE, NO_SYMBOL = 0,
 class AmsServer:
     """Serves `memory`, in which `places` gives offset and size of each symbol.
 
-    It holds `lock` while it reads or writes the memory. Every answer comes `delay()` s late. `port` is the TCP port
-    (0: any free one).
+    It holds `lock` while it reads or writes the memory. Every answer comes `delay()` s late, and to reads of the symbol
+    that `unanswered()` names none comes. `port` is the TCP port (0: any free one).
     """
 
     def __init__(
@@ -41,8 +41,10 @@ class AmsServer:
         lock: threading.Lock,
         port: int = 0,
         delay: Callable[[], float] = lambda: 0.0,
+        unanswered: Callable[[], str] = lambda: "",
     ):
-        self.memory, self.places, self.lock, self.delay = memory, dict(places), lock, delay
+        self.memory, self.places, self.lock = memory, dict(places), lock
+        self.delay, self.unanswered = delay, unanswered
         self.requests = 0
         self._clients: dict[str, socket.socket] = {}
         self._clients_lock = threading.Lock()
@@ -83,12 +85,23 @@ class AmsServer:
         try:
             while True:
                 _, length = _TCP.unpack(_exactly(client, _TCP.size))
-                answer = self._answer(_exactly(client, length))
+                frame = _exactly(client, length)
+                answer = self._answer(frame)
+                if self._reads(frame, self.unanswered()):
+                    continue
                 if late := self.delay():
                     time.sleep(late)
                 client.sendall(answer)
         except (ConnectionError, OSError, struct.error):
             return
+
+    def _reads(self, frame: bytes, symbol: str) -> bool:
+        """Whether a request reads the memory of a symbol ("": of none)."""
+        start, size = self.places.get(symbol, (0, 0))
+        if _AMS.unpack_from(frame)[4] != READ:
+            return False
+        group, offset = struct.unpack_from("<II", frame, _AMS.size)
+        return group == MEMORY and start <= offset < start + size
 
     def _answer(self, frame: bytes) -> bytes:
         target, target_port, source, source_port, command, _, length, _, invoke = _AMS.unpack_from(frame)

@@ -34,6 +34,7 @@ CATALOGUE = {
     "delay": FaultKind("every answer comes … s late", 0.04),
     "deaf": FaultKind("STOP and RELEASE are acknowledged and ignored"),
     "state": FaultKind("the state is …", 42.0),
+    "mute": FaultKind("reads of the ring are not answered, while all other requests are"),
 }
 # Faults of the program itself, from its start on.
 AT_START = {

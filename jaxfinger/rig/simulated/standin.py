@@ -34,7 +34,14 @@ def serve(controller: Controller, speed: float, port: int, stop: threading.Event
     """
     lock = threading.Lock()
     places = {contract.PREFIX + name: place for name, place in controller.place.items()}
-    server = AmsServer(controller.memory, places, lock, port, lambda: controller.amount("delay") or 0.0)
+
+    def delay() -> float:
+        return controller.amount("delay") or 0.0
+
+    def unanswered() -> str:
+        return "" if controller.amount("mute") is None else f"{contract.PREFIX}aRing"
+
+    server = AmsServer(controller.memory, places, lock, port, delay, unanswered)
     say(f"listening 127.0.0.1:{server.port}")
     pace = Lockstep(controller) if speed == 0 else RealTime(controller, speed)
     try:
