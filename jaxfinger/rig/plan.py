@@ -184,8 +184,8 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
         (place / "posture_deg").fail(f"has {len(posture)} angles; give one for each of the {finger.m} joints")
     if posture and _are_radians(posture, rig):
         given, meant = (", ".join(f"{a:g}" for a in angles) for angles in (posture, np.round(np.degrees(posture))))
-        said = f"{given} are fractions of a degree, which no fixture is set to, so these seem to be radians"
-        (place / "posture_deg").fail(f"{said}; give it in degrees ({meant})")
+        said = f"{given} are all within {RADIANS:g}° of straight, so these seem to be radians"
+        (place / "posture_deg").fail(f"{said}; give it in degrees ({meant}), or 0 for each joint that is straight")
     at = np.degrees(list(parameters.posture(finger).values()))  # also where it is the default
     for joint, angle, (low, high) in zip(finger.joint_names, at, np.degrees(finger.limits), strict=True):
         if not low - 1e-9 <= angle <= high + 1e-9:
@@ -204,12 +204,12 @@ def _check_parameters(experiment: str, parameters: Common, rig: RigDescription, 
 def _are_radians(posture: tuple[float, ...], rig: RigDescription) -> bool:
     """Whether angles given as degrees can only be meant in rad.
 
-    All are within RADIANS, and within the limits if read as rad; and one is no multiple of half a degree. A prompt asks
-    for whole degrees, and a fixture is set by eye, so nobody who means degrees loses anything by giving them.
+    All are within RADIANS, and within the limits if read as rad; and one is not 0. A fixture is set by eye, so nobody
+    who means degrees loses anything by giving 0 for a finger that is straight but for a degree or two.
     """
     low, high = rig.finger.limits.T
     small = np.abs(posture) <= RADIANS
-    return bool(np.all(small & (low <= posture) & (posture <= high)) and np.any(np.mod(posture, 0.5)))
+    return bool(np.all(small & (low <= posture) & (posture <= high)) and np.any(posture))
 
 
 def commands(trial: PlannedTrial, rig: RigDescription) -> Iterator[Step]:

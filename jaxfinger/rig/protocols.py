@@ -205,7 +205,12 @@ def _all(finger: FingerDescription, tension: float) -> dict[str, float]:
 
 
 def _angles(posture: dict[str, float]) -> str:
-    return ", ".join(f"{name} {np.degrees(angle):.0f}°" for name, angle in posture.items())
+    return ", ".join(f"{name} {_degrees(angle)}" for name, angle in posture.items())
+
+
+def _degrees(angle: float) -> str:
+    """An angle in rad as people read it: in degrees, to a tenth where it is no whole one."""
+    return f"{round(float(np.degrees(angle)), 1):g}°"
 
 
 def swept(finger: FingerDescription, joint: str, share: float) -> tuple[float, float]:
@@ -259,7 +264,7 @@ def static_torque(finger: FingerDescription, p: StaticTorque) -> Protocol:
     low, high = np.radians(p.range_deg)
     grid = np.linspace(low, high, max(2, round((p.range_deg[1] - p.range_deg[0]) / p.step_deg) + 1))
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
-    yield from _coupled(posture, p.joint)
+    yield from _coupled(posture, p.joint, _motion(finger, posture, p.joint, p.range_deg, p.speed_deg_s))
     speed, acceleration = np.radians((p.speed_deg_s, p.acceleration_deg_s2)).tolist()
     approach = min(0.05, float(grid[1] - grid[0]) / 2)
     yield JointMove(p.joint, float(low), speed, acceleration)
@@ -287,7 +292,7 @@ def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
     low, high = np.radians(p.range_deg).tolist()
     acceleration = float(np.radians(p.acceleration_deg_s2))
     yield from _tared(finger, posture, ("external_torque",), p.tension_rate)
-    yield from _coupled(posture, p.joint)
+    yield from _coupled(posture, p.joint, _motion(finger, posture, p.joint, p.range_deg, max(p.speeds_deg_s)))
     yield JointMove(p.joint, low, float(np.radians(min(p.speeds_deg_s))), acceleration)
     yield Reached()
     yield Start()
@@ -297,10 +302,25 @@ def dynamic_torque(finger: FingerDescription, p: DynamicTorque) -> Protocol:
             yield Reached()
 
 
-def _coupled(posture: dict[str, float], joint: str) -> Protocol:
-    """Couple one joint to the external motor, the others fixed."""
+def _coupled(posture: dict[str, float], joint: str, motion: str = "") -> Protocol:
+    """Couple one joint to the external motor, the others fixed. `motion` says what the motor will do."""
     others = {name: angle for name, angle in posture.items() if name != joint}
-    yield Setup(f"Couple the external motor to {joint}; the other joints stay fixed.", fixed=others, motor=joint)
+    text = f"Couple the external motor to {joint}; the other joints stay fixed.{motion}"
+    yield Setup(text, fixed=others, motor=joint)
+
+
+def _motion(
+    finger: FingerDescription, posture: dict[str, float], joint: str, range_deg: tuple[float, float], speed: float
+) -> str:
+    """Sentence, after a space, on what the external motor will do, so that a plan in a wrong unit is seen before Enter.
+
+    It moves the joint from its posture and through `range_deg`, at up to `speed` (deg/s).
+    """
+    ends = (posture[joint], *np.radians(range_deg).tolist())
+    low, high = min(ends), max(ends)
+    share = (high - low) / float(np.ptp(finger.limits[finger.joint_names.index(joint)]))
+    across = f"between {_degrees(low)} and {_degrees(high)}, {100 * share:.0f} % of its range"
+    return f" The motor will move it {across}, at up to {speed:g}°/s."
 
 
 def tendon_friction(finger: FingerDescription, p: TendonFriction) -> Protocol:

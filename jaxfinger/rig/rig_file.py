@@ -22,6 +22,8 @@ FROZEN_S = 1.0
 # s, the longest deadline that a rig file may set. The finger may be under tension until it is over, and within 5 s a
 # person at the bench has reached for the switch.
 MAX_DEADLINE_S = 5.0
+# deg, the smallest `joint_margin_deg` but 0. Margins of 1° to 25° would be less if written in rad.
+MIN_MARGIN_DEG = 0.5
 # deg/s², default of `joint_acceleration_deg_s2`: twice what a plan's trials have by default (protocols.py).
 ACCELERATION_DEG_S2 = 1200.0
 
@@ -106,6 +108,10 @@ class LimitsTable:
     def __post_init__(self):
         if self.tension_rate > self.tension_rate_max:
             raise Fault("of set-points is above `tension_rate_max`, so every ramp would trip", "tension_rate")
+        if 0.0 < self.joint_margin_deg < MIN_MARGIN_DEG:
+            said = f"is {self.joint_margin_deg:g}°, so it seems to be radians"
+            mend = f"give it in degrees ({np.degrees(self.joint_margin_deg):.2g}), or 0 for none"
+            raise Fault(f"{said}; {mend}", "joint_margin_deg")
         if self.joint_velocity_deg_s > self.joint_velocity_max_deg_s:
             raise Fault("is above `joint_velocity_max_deg_s`, so every move would trip", "joint_velocity_deg_s")
 

@@ -77,6 +77,13 @@ def test_a_deadline_of_an_hour_is_none(key):
         parse_rig(text)
 
 
+def test_a_margin_in_radians_is_no_margin():
+    """Commands would reach the joint's stops."""
+    with pytest.raises(UserError, match=r"joint_margin_deg: is 0\.035°, so it seems to be radians; .* \(2\), or 0 for"):
+        parse_rig(GOOD.replace("joint_margin_deg = 2.0", "joint_margin_deg = 0.035"))
+    assert parse_rig(GOOD.replace("joint_margin_deg = 2.0", "joint_margin_deg = 0")).limits.joint_margin == 0.0
+
+
 @pytest.mark.parametrize("key", ["tension_max", "tension_rate_max", "joint_velocity_max_deg_s", "joint_torque_max"])
 def test_a_limit_of_the_controller_that_limits_nothing_is_refused(key):
     with pytest.raises(UserError, match=f"controller.{key}: is 1e\\+09 .*which is outside"):

@@ -47,9 +47,11 @@ def steps(text, rig):
         (
             'experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.35, 0.52, 0.0]',
             6,
-            "0.35, 0.52, 0 are fractions of a degree, which no fixture is set to, so these seem to be radians; "
-            "give it in degrees (20, 30, 0)",
+            "0.35, 0.52, 0 are all within 2° of straight, so these seem to be radians; "
+            "give it in degrees (20, 30, 0), or 0 for each joint that is straight",
         ),
+        ('experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.5, 1.0, 0.5]', 6, "give it in degrees (29, 57, 29)"),
+        ('experiment = "ID.2"\njoint = "MCP"\nposture_deg = [0.0, 1.0, 0.0]', 6, "so these seem to be radians"),
         ('experiment = "VD.3"\nmean = [1.0]', 5, "4 active tendons"),
         ('experiment = "ID.2"\njoint = "MCP"\nrepeats = 1000000000', 6, "outside 1 to 1000"),
         ('experiment = "ID.3-dynamic"\njoint = "MCP"\npasses = 1000000000', 6, "outside 1 to 1000"),
@@ -116,10 +118,10 @@ def test_the_shipped_plan_holds_every_experiment(rig):
 
 @pytest.mark.parametrize(
     "posture",
-    ["0.0, 0.0, 0.0", "0.5, 1.0, 1.5", "0.0, 2.0, 0.0", "0.35, 20.0, 30.0", "2.25, 0.0, 0.0", "-1.0, 0.0, 0.35"],
+    ["0.0, 0.0, 0.0", "0.5, 1.0, 15.0", "0.35, 20.0, 30.0", "2.25, 0.0, 0.0", "-1.0, 0.0, 0.35"],
 )
 def test_small_postures_in_degrees_are_taken(rig, posture):
-    """Whole and half degrees; or one beyond 2 rad, or beyond a joint's lower end if read as rad."""
+    """Straight; or one beyond 2 rad, or beyond a joint's lower end if read as rad."""
     assert parse_plan(HEAD + f'experiment = "ID.2"\njoint = "MCP"\nposture_deg = [{posture}]', rig).trials
 
 
@@ -130,6 +132,31 @@ def test_the_default_posture_is_checked_too():
     with pytest.raises(UserError, match=r"plan.toml, line 3: .*posture_deg: 20° for MCP is outside its limits -10° to"):
         parse_plan(HEAD + 'experiment = "VD.1"', short)
     parse_plan(HEAD + 'experiment = "VD.1"\nposture_deg = [15.0, -10.0, 5.0]', short)
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        (
+            'experiment = "ID.3-static"\nrange_deg = [0.0, 70.0]',
+            "between 0° and 70°, 69 % of its range, at up to 30°/s.",
+        ),
+        ('experiment = "ID.3-dynamic"\nposture_deg = [22.5, 80.0, 20.0]', "between 10° and 65°, 54 % of its range, at"),
+        ('experiment = "ID.3-dynamic"\nrange_deg = [30.0, 50.0]\nspeeds_deg_s = [0.5, 1.5]', "at up to 1.5°/s."),
+        ('experiment = "ID.3-static"\nposture_deg = [85.0, 0.0, 0.0]', "between 0° and 85°, 83 % of its range"),
+    ],
+)
+def test_the_prompt_before_the_motor_moves_says_how_far_and_how_fast(rig, keys, says):
+    """Whoever presses Enter sees a plan in another unit; so does the dry run."""
+    (trial,) = parse_plan(f'{HEAD}{keys}\njoint = "MCP"', rig).trials
+    *_, prompt = estimate(trial, rig).prompts
+    assert prompt.startswith("The drives are off. Couple the external motor to MCP; the other joints stay fixed. The")
+    assert says in prompt
+
+
+def test_the_prompt_asks_for_the_angles_of_the_plan(rig):
+    (trial,) = parse_plan(f'{HEAD}experiment = "ID.2"\njoint = "MCP"\nposture_deg = [22.5, 0.4, -5.0]', rig).trials
+    assert "Fix all joints: MCP 22.5°, PIP 0.4°, DIP -5°." in estimate(trial, rig).prompts[0]
 
 
 def test_a_prompt_after_which_something_moves_says_hands_off(rig):
