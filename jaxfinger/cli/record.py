@@ -55,7 +55,7 @@ def record(
         if outcome.cause:
             kept = f"{output} holds what was recorded, go on with --resume (the log is {outcome.log})"
             if not output.exists():
-                kept = f"rescue what reached the disk with jaxfinger recover {outcome.log}"
+                kept = f"rescue what reached the disk with jaxfinger recover {outcome.log} --output {output}"
             raise UserError(f"{outcome.cause.rstrip('.')}; {kept}.")
         said = f"{output}: {counted(len(outcome.complete), 'trial')}, all complete"
     except UserError as error:
@@ -64,7 +64,8 @@ def record(
         raise
     except KeyboardInterrupt:
         log = log_path(output)
-        kept = f"; rescue what reached the disk with jaxfinger recover {log}" if log.exists() else ""
+        rescue = f"; rescue what reached the disk with jaxfinger recover {log} --output {output}"
+        kept = rescue if log.exists() else ""
         said = f"the run was interrupted before its end was seen; see that tension is off{kept}."
         if view.stalled:
             _leave(f"jaxfinger: {said}", 2)

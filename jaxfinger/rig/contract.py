@@ -205,7 +205,7 @@ _SENTENCES = {
 _SEE = {  # what to look at after a trip
     Trip.TENSION: "the tendon's path, its drive and its load cell",
     Trip.TENSION_RATE: "whether a tendon slips or a cable is loose",
-    Trip.SLACK: "whether the tendon is torn or off its pulley",
+    Trip.SLACK: "whether the emergency stop took the drives' torque, or the tendon is torn or off its pulley",
     Trip.POSITION: "the joint's fixture and its encoder",
     Trip.VELOCITY: "the joint's fixture or coupling, and its encoder",
     Trip.TORQUE: "what blocks the joint",
@@ -214,7 +214,7 @@ _SEE = {  # what to look at after a trip
     Trip.HEARTBEAT: "what else this computer does, and the network",
     Trip.FROZEN: "its cable and terminal",
     Trip.STALE: "whether its task runs",
-    Trip.CLOCK: "the controller's task and its distributed clock",
+    Trip.CLOCK: "the controller's task, its distributed clock, and whether this computer slept",
     Trip.RECORDER: "the disk",
     Trip.HOST: "the cause that it gave then",
     Trip.TRACKING: "the tendon's drive and its load cell",

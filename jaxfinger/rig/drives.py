@@ -62,8 +62,10 @@ class Drives:
         if still := self._pulled():  # Before a prompt has hands at the finger.
             self._refuse(still)
         self.course.drives_are_off()
-        straight = dict.fromkeys(rig.description.finger.joint_names, 0.0)
-        self.prepare(Setup("Fix the finger straight: all joints at 0°.", straight))
+        described = rig.description
+        which = f"It is '{described.specimen}' on rig '{described.name}'."  # Another rig may have people beside it.
+        straight = dict.fromkeys(described.finger.joint_names, 0.0)
+        self.prepare(Setup(f"Fix the finger straight: all joints at 0°. {which}", straight))
 
     def _clear_stop(self) -> None:
         """Clear a latched stop, in the operator's name. The operator has just agreed."""

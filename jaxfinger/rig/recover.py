@@ -31,8 +31,9 @@ def recover(path: str | Path, output: str | Path, overwrite: bool = False) -> Re
     """Write the session that a log holds. The log is not changed.
 
     Raises:
-        UserError: the log cannot be read, or the session cannot be written.
+        UserError: a recorder still writes to the log, it cannot be read, or the session cannot be written.
     """
+    wal.refuse_live(path)
     log = read_log(path)
     session = publish(log, output, overwrite)
     incomplete = tuple(t.name for t in session if not t.complete)

@@ -132,7 +132,10 @@ def _publish(plan: Plan, recorder: Recorder, output: Path, cause: str, resume: b
     except (UserError, KeyboardInterrupt) as error:
         said = str(error).rstrip(".") or f"{output}: interrupted while it was written"
         ended = f"{cause}; " if cause else ""
-        raise UserError(f"{ended}{said}; jaxfinger recover {path} makes it once that is mended.") from error
+        if not path.exists():
+            raise UserError(f"{ended}with {path} all that was recorded is lost.") from error
+        mend = f"once that is mended, jaxfinger recover {path} --output {output} makes it"
+        raise UserError(f"{ended}{said}; {mend}.") from error
     if not cause:
         path.unlink()
     return Outcome(output, tuple(r.name for r in log.trials if r.complete), cause, path if cause else None)

@@ -19,6 +19,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,16 @@ def _opened(path: Path, mode: str) -> io.FileIO:
     except OSError:
         pass  # A file system without locks: the controller itself refuses a second recorder.
     return file
+
+
+def refuse_live(path: str | Path) -> None:
+    """Raise UserError where a recorder still writes to a log: its run goes on, maybe with the finger armed."""
+    with suppress(OSError), open(path, "rb") as file:  # What cannot be opened is the reader's to report.
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            said = "a recorder still writes to it, and the finger may be armed"
+            raise UserError(f"{path}: {said}; end that run first, by its stop key or kill.") from error
 
 
 def frames(file: io.BufferedIOBase, name: str = "log") -> Iterator[Frame]:

@@ -76,7 +76,9 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
     assert len(outcome.complete) == 2
     straight, *rest = prompts
     off, on = "The drives are off.", "Then hands off: Enter switches them on."
-    assert straight == f"{off} Fix the finger straight: all joints at 0°. {on}"
+    assert (
+        straight == f"{off} Fix the finger straight: all joints at 0°. It is 'simulated finger' on rig 'example'. {on}"
+    )
     assert any(text.startswith("Hold DIP, free it, and move it slowly by hand") for text in rest)
     assert rest[-1] == f"{off} Couple the external motor to MCP; the other joints stay fixed. {on}"
 

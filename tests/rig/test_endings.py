@@ -160,10 +160,35 @@ def test_a_log_that_is_deleted_ends_the_run(rig, record, tmp_path, monkeypatch):
         wait_until_written(log_path(path), "02-ID.4-T3-MCP")
         log_path(path).unlink()
 
-    with pytest.raises(
-        UserError, match=r"02-ID.4-T3-MCP: session\.h5\.wal cannot be written: somebody has deleted it; the"
-    ):
+    says = r"02-ID.4-T3-MCP: session\.h5\.wal cannot be written: somebody has deleted it; .*all that was recorded is"
+    with pytest.raises(UserError, match=says):
         record(SimulatedRig(rig), delete, output=path)
+
+
+def test_a_file_that_has_come_to_lie_at_the_output_is_not_overwritten(rig, record, tmp_path):
+    path = tmp_path / "session.h5"
+    with pytest.raises(
+        UserError, match=r"session\.h5: exists already .* jaxfinger recover .*\.wal --output .* makes it"
+    ):
+        record(SimulatedRig(rig), lambda m: path.write_text("precious"), output=path)
+    assert path.read_text() == "precious"
+    path.unlink()
+    assert len(recover(log_path(path), path).trials) == 2
+
+
+def test_a_log_is_not_recovered_while_its_run_goes_on(rig, record, tmp_path):
+    """Whoever takes a run for dead is told that its finger may be armed; and its session keeps its place."""
+    path, said = tmp_path / "session.h5", []
+
+    def rescue(m):
+        with pytest.raises(
+            UserError, match=r"session\.h5\.wal: a recorder still writes to it, and the finger may"
+        ) as e:
+            recover(log_path(path), path)
+        said.append(e)
+
+    assert record(SimulatedRig(rig), rescue, output=path).cause == ""
+    assert said
 
 
 def test_the_operators_stop_key(rig, record):

@@ -8,6 +8,7 @@ import pytest
 
 from jaxfinger.rig import reader as module
 from jaxfinger.rig import wal
+from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.reader import EPOCH_NS, Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor
@@ -43,6 +44,23 @@ def test_the_drift_between_two_clocks_shows_from_trial_to_trial(simulated, tmp_p
     for ahead, at in (first, second):
         assert ahead * 1e-9 == pytest.approx(lead_s + drift * (at - start) * 1e-9, abs=1e-3)
     assert (second[0] - first[0]) / (second[1] - first[1]) == pytest.approx(drift, abs=2e-4)
+
+
+def test_a_computer_that_has_slept_is_not_taken_for_a_wrong_clock_alone(simulated, tmp_path):
+    """Its own clock stood still, while the controller's samples went on; the drives are off."""
+    recorder, controller = Recorder(tmp_path / "a.wal", {}), simulated.controller
+    with simulated:
+        reader = Reader(simulated, recorder, Supervisor(simulated.description))
+        simulated.synchronous = simulated.simulated_time = False
+        for samples in (20, 20, 10_000):
+            for _ in range(samples):
+                controller.cycle()
+            assert reader._step(time.monotonic())
+            assert (reader.unarmed_violation is None) == (samples == 20)
+    recorder.close()
+    assert reader.unarmed_violation is not None
+    assert reader.unarmed_violation.trip is Trip.CLOCK
+    assert "whether this computer slept" in reader.unarmed_violation.sentence
 
 
 def test_whatever_goes_wrong_in_a_read_is_an_error_that_ends_the_trial(simulated, tmp_path, monkeypatch):

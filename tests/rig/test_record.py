@@ -215,7 +215,8 @@ def test_a_session_that_cannot_be_written_stays_in_its_log(files, rig, monkeypat
         raise UserError(f"{output}: cannot be written (No space left on device)")
 
     monkeypatch.setattr("jaxfinger.rig.convert.publish", full)
-    with pytest.raises(UserError, match=r"No space left.*; jaxfinger recover .*s\.h5\.wal makes it"):
+    says = r"No space left.*; once that is mended, jaxfinger recover .*s\.h5\.wal --output .*s\.h5 makes it"
+    with pytest.raises(UserError, match=says):
         run(parse_plan(SHORT, rig), SimulatedRig(rig), files / "s.h5")
     monkeypatch.undo()
     recover(files / "s.h5.wal", output=files / "s.h5")
@@ -228,7 +229,7 @@ def test_ctrl_c_while_the_session_is_written_is_a_sentence(files, monkeypatch):
 
     monkeypatch.setattr("jaxfinger.rig.convert.publish", interrupted)
     with pytest.raises(
-        UserError, match=r"s\.h5: interrupted while it was written; jaxfinger recover .*s\.h5\.wal makes"
+        UserError, match=r"s\.h5: interrupted while it was written; once .* jaxfinger recover .*s\.h5\.wal --output"
     ):
         record(files / "plan.toml", rig=files / "rig.toml", output=files / "s.h5", yes=True)
     assert (files / "s.h5.wal").exists()
