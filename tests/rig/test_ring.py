@@ -53,7 +53,7 @@ def test_a_torn_record_is_read_again(rig):
         reads = []
         plain = machine._read
 
-        def mended(symbol, offset, size):
+        def mended(symbol, offset, size, urgent=False):
             reads.append(symbol)
             if reads.count("aRing") == 2:
                 machine.controller.memory[at : at + 8] = whole
@@ -88,7 +88,7 @@ def test_a_restart_while_the_ring_is_read_is_noticed(rig, monkeypatch):
             machine.controller.cycle()
         read = machine._read
 
-        def restarted_before(symbol, offset, size):
+        def restarted_before(symbol, offset, size, urgent=False):
             if symbol == "aRing":
                 machine.controller.start()
             return read(symbol, offset, size)
@@ -270,7 +270,7 @@ def test_a_stop_is_written_again_where_a_command_that_it_overtook_arrives_late(r
         late["id"], late["kind"], late["rate"], late["target"] = machine._id, contract.Kind.TENSION, 5.0, 5.0
         write, written = machine._write, []
 
-        def overtaken(symbol, data, mend=True):
+        def overtaken(symbol, data, mend=True, urgent=False):
             write(symbol, data, mend)
             if not written:
                 write(symbol, late.tobytes(), mend)
