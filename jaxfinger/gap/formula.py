@@ -61,8 +61,8 @@ class Parameters:
 
     `benchmarks/formula.py fit` chose `imitator_gain`, `form_error_unlisted`, `unlisted_threshold` and `unlisted_slope`,
     rounded, from sealed cases, and an earlier fit chose `cause_cost`. The log score of cases with something unlisted
-    chose `imitator_odds`; it hardly changes between 6 and 10. The others are set for the reasons beside them.
-    The fit found no values that do better on cases it had not seen (docs/results.md).
+    chose `imitator_odds`; twice as much changes it by less than 0.1 a case. The others are set for the reasons beside
+    them. The fit found no values that do better on cases it had not seen (docs/results.md).
     """
 
     variance_floor: float = 2.0  # φ, noise variances: the colour of the noise is known from a few repeats only.
@@ -74,7 +74,7 @@ class Parameters:
     form_error_unlisted: float = 0.27  # ρ² in `unlisted`: less than that share of E_c may be the listed causes' own.
     unlisted_threshold: float = 6.0  # nats left unexplained at which something unlisted is as likely as not
     unlisted_slope: float = 1.0  # change of the log odds that something is unlisted, per nat left unexplained
-    imitator_odds: float = 8.0  # λ: odds that a cause which leaves as much as it brings imitates something unlisted
+    imitator_odds: float = 8.0  # λ: odds that the only cause imitates, if it leaves all energy and as much evidence
 
 
 @dataclass(frozen=True)

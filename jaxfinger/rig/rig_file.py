@@ -22,7 +22,8 @@ FROZEN_S = 1.0
 # s, the longest deadline that a rig file may set. The finger may be under tension until it is over, and within 5 s a
 # person at the bench has reached for the switch.
 MAX_DEADLINE_S = 5.0
-# deg, the smallest `joint_margin_deg` but 0. Margins of 1° to 25° would be less if written in rad.
+# deg, the smallest `joint_margin_deg` but 0. In rad the same number is 29°, more than any joint has to spare, so
+# what is less is a margin in rad.
 MIN_MARGIN_DEG = 0.5
 # deg/s², default of `joint_acceleration_deg_s2`: twice what a plan's trials have by default (protocols.py).
 ACCELERATION_DEG_S2 = 1200.0

@@ -32,9 +32,9 @@ _MAX_VALUES = {
     "fingertip_force": (("N", 100.0), ("mN", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
-_MAX_TURNS = (
-    0.3  # Angles that are never larger may be turns, as some motor drives count: a finger's joint makes no more.
-)
+# Angles that are never larger may be turns, in which some motor drives count: no joint of a finger turns by more than
+# 110°. In rad they would be 17° at most, which is little for a recording.
+_MAX_TURNS = 0.3
 # Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
 # since in N mm they would be a hundredth of it, less than any load moves them. Larger ones than the second are in N mm:
 # `check` refuses them in N m. Between them the unit stays open.

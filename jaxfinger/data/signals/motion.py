@@ -27,7 +27,9 @@ REST_SPEED_NOISE = 6.0  # times the noise of the speed: a slower joint may be at
 REST_SPEED_SHARES = 1e-3, 0.1
 STILL_SHARE = 0.1  # of the fastest motion of the trial: a stepped column that is slower is held.
 MIN_HOLD = 0.2  # s, at the protocol's pace: one length of the filter, 1/HOLD_CUTOFF_HZ, beside the blurred ends.
-ROUNDING = 1e-3  # of an interval: stamps are right to that, so that a sample at the edge of a hold is in it.
+# Of an interval, by which rounding may move a stamp: 1e-7 s, the last digit of many logs, at 10 kHz. A sample at the
+# edge of a hold is in it all the same.
+ROUNDING = 1e-3
 # A ramp is at least this many blocks of 1/20 s long. Only the block in which a held tendon slips is uncertain, and in a
 # ramp that is a twentieth.
 RAMP_BLOCKS = 20
