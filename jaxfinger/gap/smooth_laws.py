@@ -1,7 +1,8 @@
 """The part of a residual that smooth laws, with or without memory, could explain.
 
 Features of a column are polynomials of angles and tensions, functions of speed, direction, time, and of the distance
-since the last reversal. They bound what any listed or unlisted law could explain; they never name a cause.
+since the last reversal; speeds and directions also times angles. They bound what any listed or unlisted law could
+explain; they never name a cause.
 """
 
 from collections.abc import Iterator
@@ -49,7 +50,8 @@ def features(
     x, scales = stack.batch.x, problem.scales
     finger = problem.nominal.finger
     q, qd, f = np.asarray(x.q), np.asarray(x.qd), np.asarray(x.tension)
-    direction, time = np.asarray(x.joint_direction), np.asarray(x.time)
+    direction, tendon_direction = np.asarray(x.joint_direction), np.asarray(x.tendon_direction)
+    time = np.asarray(x.time)
     own, taut = concerned(finger, channel, column)
     out: dict[str, list[np.ndarray]] = {
         "q": [],
@@ -63,8 +65,9 @@ def features(
     for i in own:
         u = _unit(q[i])
         out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
-        out["qd"] += [_unit(qd[i]) ** p for p in (1, 2, 3)]
-        out["qd"] += [np.exp(-np.abs(qd[i]) / v) for v in np.multiply(SPEEDS, scales.speed[i])]
+        v = _unit(qd[i])
+        out["qd"] += [v, v**2, v**3, v * u, v * u**2]
+        out["qd"] += [np.exp(-np.abs(qd[i]) / w) for w in np.multiply(SPEEDS, scales.speed[i])]
         out["direction"] += [direction[i] * u**p for p in range(3)]
         travelled = since_reversal(_smoothed(q[i]))
         for length in np.multiply(LENGTHS, scales.angle[i]):
@@ -78,6 +81,8 @@ def features(
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
             pulled = since_reversal(_smoothed(f[k])) / (PULL * scales.tension[k])
             out["distance since reversal"] += [np.exp(-np.abs(pulled)) * np.tanh(10.0 * pulled)]
+            if channel == "tendon_excursion":  # In torques, the nominal friction of tendons leaves nothing of it.
+                out["direction"] += [tendon_direction[k]]
     for i in range(finger.m):
         if i not in own:
             out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]

@@ -1,13 +1,21 @@
 """The features that bound what nobody knows."""
 
 from dataclasses import replace
+from itertools import combinations_with_replacement
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxfinger.data import read_session
 from jaxfinger.effects import Scales
-from jaxfinger.gap.smooth_laws import features, measured_columns
+from jaxfinger.gap.problem import build
+from jaxfinger.gap.signatures import whitened
+from jaxfinger.gap.smooth_laws import concerned, features, measured_columns, orthonormal_basis, white_features
+from jaxfinger.identify import Recipe
 from jaxfinger.model import Motion
+
+SHIPPED = Path(__file__).parents[2] / "datasets" / "paper-finger" / "session.h5"
 
 
 def quicker_and_pulled_harder(problem, time: float, force: float):
@@ -35,3 +43,56 @@ def test_they_are_those_of_the_same_laws_on_a_quicker_or_stronger_machine(plante
         for variable, members in mine.items():
             for a, b in zip(members, theirs[variable], strict=True):
                 np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9, err_msg=f"{e} {c} {k} {variable}")
+
+
+def drawn_laws(a, b, rng, count=6):
+    """Smooth laws of two variables, or of one for both, drawn at random: sigmoids of sums, products of sigmoids."""
+    for _ in range(count):
+        (u, v), (c, d) = 1.5 * rng.standard_normal(2), 0.5 * rng.standard_normal(2)
+        yield np.tanh(u * a + v * b + c)
+        yield np.tanh(u * a + c) * np.tanh(v * b + d)
+
+
+def missed(problem, e, c, k, pick, laws):
+    """Share of the energy of each law of a column that neither features nor nominal parameters explain."""
+    explained = np.vstack([*white_features(problem, e, c, k, pick).values()])
+    J = problem.J[problem.rows[e].start + pick].T
+    Q = orthonormal_basis(explained[np.any(explained, axis=1)])
+    off = J - (J @ Q) @ Q.T
+    U, s, _ = np.linalg.svd(off.T, full_matrices=False)
+    Q = np.hstack([Q, U[:, s > 1e-9 * np.linalg.norm(J)]])
+    raw = np.zeros((len(laws), *problem.stacks[e].batch.y[c].shape))
+    raw[:, k] = laws
+    white = whitened(raw, problem, problem.rows[e], pick, c)
+    return 1.0 - np.sum((white @ Q) ** 2, axis=1) / np.sum(white**2, axis=1)
+
+
+def varies_in_a_trial(s):
+    """Whether a signal varies in some trial by a tenth of its largest value: one zero a trial hides what does not."""
+    return np.ptp(s, axis=-1).max() > 0.1 * np.abs(s).max()
+
+
+def check_that_features_hold_drawn_laws(problem, most):
+    """Of laws of any two variables that a column depends on, features and nominal parameters leave the share `most`."""
+    rng = np.random.default_rng(0)
+    for e, c, k, pick in measured_columns(problem):
+        x = problem.stacks[e].batch.x
+        own, taut = concerned(problem.nominal.finger, c, k)
+        i, f = own[0], [np.asarray(x.tension)[t] for t in taut]
+        signals = {"q": x.q[i], "speed": x.qd[i], "direction": x.joint_direction[i]}
+        signals |= {"tension": f[0]} if f and f[0].any() else {}
+        signals |= {"tendon's direction": x.tendon_direction[k]} if c == "tendon_excursion" else {}
+        unit = {n: np.asarray(s) / np.abs(s).max() for n, s in signals.items() if varies_in_a_trial(np.asarray(s))}
+        for (a, s), (b, t) in combinations_with_replacement(unit.items(), 2):
+            left = np.median(missed(problem, e, c, k, pick, list(drawn_laws(s, t, rng))))
+            assert left < most, f"{e} {c} {k}: {left:.2f} of laws of {a} and {b}"
+
+
+def test_they_hold_most_of_any_smooth_law_of_two_variables(planted):
+    check_that_features_hold_drawn_laws(planted, 0.1)
+
+
+@pytest.mark.long
+def test_they_hold_most_of_any_smooth_law_in_free_motion():
+    # Laws of the directions of a joint and a tendon together turn at instants of their own, and leave 0.33.
+    check_that_features_hold_drawn_laws(build(read_session(SHIPPED), Recipe()), 0.4)
