@@ -85,13 +85,13 @@ class Iterate(eqx.Module):
 
     trial: PyTree
     here: Factor
-    cost: Float[Array, ""]  # at the best point; infinite before the first
-    step: Float[Array, " p"]  # full Gauss–Newton step from the best point
-    slope: Float[Array, ""]  # derivative of the cost along the step
-    length: Float[Array, ""]  # share of the step that is tried
-    size: Float[Array, ""]  # norm of the full step, in standard deviations
-    stalled: Int[Array, ""]  # steps without progress since the cost last fell
-    evaluations: Int[Array, ""]  # linearisations so far
+    cost: Float[Array | np.ndarray, ""]  # at the best point; infinite before the first
+    step: Float[Array | np.ndarray, " p"]  # full Gauss–Newton step from the best point
+    slope: Float[Array | np.ndarray, ""]  # derivative of the cost along the step
+    length: Float[Array | np.ndarray, ""]  # share of the step that is tried
+    size: Float[Array | np.ndarray, ""]  # norm of the full step, in standard deviations
+    stalled: Int[Array | np.ndarray, ""]  # steps without progress since the cost last fell
+    evaluations: Int[Array | np.ndarray, ""]  # linearisations so far
     outcome: Outcome
 
 
@@ -205,12 +205,13 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
 
 
 def begin(y: PyTree) -> Iterate:
-    """State of a search before the first linearisation, with `y` as the trial point."""
-    flat = ravel_pytree(y)[0]
+    """State of a search before the first linearisation, with `y` as the trial point; NumPy's where `y` is."""
+    flat = y if isinstance(y, np.ndarray) else ravel_pytree(y)[0]
+    xp = flat.__array_namespace__()
     # Scalars get their type here, as those of later states have it, so that one compiled step serves all states.
-    zero, one, infinite, count = jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf, float), jnp.zeros((), int)
-    none = Factor(jnp.zeros((flat.size, flat.size)), jnp.zeros_like(flat), zero)
-    return Iterate(y, none, infinite, jnp.zeros_like(flat), zero, one, zero, count, count, Outcome.running)
+    zero, one, infinite, count = (xp.asarray(x) for x in (0.0, 1.0, xp.inf, 0))
+    none = Factor(xp.zeros((flat.size, flat.size)), xp.zeros_like(flat), zero)
+    return Iterate(y, none, infinite, xp.zeros_like(flat), zero, one, zero, count, count, Outcome.running)
 
 
 def state_of_vector(state: Iterate, trial: Float[Array, " p"]) -> Iterate:

@@ -13,9 +13,9 @@ minimises that cost: the sum of squares of s is 2 Σ H(r), and its gradient is 2
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -41,24 +41,38 @@ PANEL = 32  # columns of a panel of ?geqrt: LAPACK's own choice for ?geqrf
 (_geqrt,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
-class Tangent(NamedTuple):
+@dataclass(frozen=True)
+class Tangent:
     """Residuals of one experiment at a model and their derivatives by p free parameters, in each channel's unit."""
 
-    residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted
+    there: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, where the experiment was linearised
     slopes: dict[str, Float[np.ndarray, "p _columns B T"]]
+    by: Float[np.ndarray, " p"] | None = None  # step of the parameters since
+
+    @cached_property
+    def residuals(self) -> dict[str, Float[np.ndarray, "_columns B T"]]:
+        """Measured − predicted after the step, which costs a sum over all slopes."""
+        if self.by is None:
+            return self.there
+        return {c: r + np.tensordot(self.by, self.slopes[c], 1) for c, r in self.there.items()}
 
     def moved(self, by: Float[np.ndarray, " p"]) -> "Tangent":
         """Tangent after a step `by` of the parameters, exact where the residuals are affine in those that move."""
-        return Tangent({c: r + np.tensordot(by, self.slopes[c], 1) for c, r in self.residuals.items()}, self.slopes)
+        return replace(self, by=by if self.by is None else self.by + by)
 
 
 @dataclass(frozen=True)
 class White:
     """Residuals of one experiment at a model, and its Jacobian by p free parameters, both white."""
 
-    residuals: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, by channel, in the channel's unit
-    white: Float[np.ndarray, "B rows"]  # the same, white and flat, before Huber's cost
+    along: Tangent  # the same, in each channel's unit
+    white: Float[np.ndarray, "B rows"]  # residuals, white and flat, before Huber's cost
     jacobian: Float[np.ndarray, "B rows p"]  # J of the white residuals, before Huber's cost
+
+    @property
+    def residuals(self) -> dict[str, Float[np.ndarray, "_columns B T"]]:
+        """Measured − predicted, by channel, in the channel's unit."""
+        return self.along.residuals
 
 
 @dataclass(frozen=True)
@@ -70,21 +84,21 @@ class Linearised(White):
     def moved(
         self,
         by: Float[np.ndarray, " p"],
-        residuals: dict[str, Float[np.ndarray, "_columns B T"]],
+        along: Tangent,
         limit: float,
         weights: Float[np.ndarray, " B"] | None,
     ) -> "Linearised":
         """Linearisation after a step `by` of the parameters, where the residuals are affine in them.
 
-        `residuals` are those at the new parameters. White rows change by J δ. The last column of the factors changes by
-        R δ, unless Huber's cost gives the rows other weights. `limit` and `weights` must be those of this object.
+        `along` is the tangent at the new parameters. White rows change by J δ. The last column of the factors changes
+        by R δ, unless Huber's cost gives the rows other weights. `limit` and `weights` must be those of this object.
         """
         white = self.white + self.jacobian @ by
         if limit:
-            return Linearised(residuals, white, self.jacobian, factored(white, self.jacobian, limit, weights))
+            return Linearised(along, white, self.jacobian, factored(white, self.jacobian, limit, weights))
         factor = self.factor.copy()
         factor[..., -1] += factor[..., :-1] @ by
-        return Linearised(residuals, white, self.jacobian, factor)
+        return Linearised(along, white, self.jacobian, factor)
 
 
 def white_rows(model: Model, batch: Batch, filters: Filters) -> tuple[dict, Float[Array, "B rows"]]:
@@ -224,13 +238,13 @@ def whitened(
     `limit`: Huber's, in standard deviations, 0 for none. `weights`: of the trials, 1 by default.
     """
     x = white_tangent(along, batch, filters, reversals)
-    return Linearised(x.residuals, x.white, x.jacobian, factored(x.white, x.jacobian, limit, weights))
+    return Linearised(along, x.white, x.jacobian, factored(x.white, x.jacobian, limit, weights))
 
 
 def white_tangent(along: Tangent, batch: Batch, filters: Filters, reversals: Reversals = NO_REVERSALS) -> White:
     """Whiten a tangent, without compressing it."""
     white = white_of(along.residuals, batch, filters, reversals)
-    return White(along.residuals, white, _white_jacobian(along.slopes, batch, filters, reversals))
+    return White(along, white, _white_jacobian(along.slopes, batch, filters, reversals))
 
 
 def factored(

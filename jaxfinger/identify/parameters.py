@@ -22,6 +22,8 @@ from jaxfinger.data.schema import units_where
 from jaxfinger.effects import CatalogueEffect, Site
 from jaxfinger.model import Finger, Model
 
+Shapes = tuple[tuple[int, ...] | None, ...]
+
 
 def ravel(model: Model) -> Float[Array | np.ndarray, " P"]:
     """Flat vector of the model: its floating-point leaves in order."""
@@ -32,11 +34,10 @@ def ravel(model: Model) -> Float[Array | np.ndarray, " P"]:
 
 def with_flat(model: Model, flat: Float[Array | np.ndarray, " P"]) -> Model:
     """Copy of the model with the flat vector `flat`, the inverse of `ravel`."""
-    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-    leaves, treedef = jax.tree.flatten(arrays)
+    leaves = _leaves(model)
     ends = np.cumsum([0] + [leaf.size for leaf in leaves])
     new = [flat[a:b].reshape(leaf.shape) for leaf, (a, b) in zip(leaves, pairwise(ends), strict=True)]
-    return eqx.combine(jax.tree.unflatten(treedef, jax.device_put(new)), rest)
+    return _with_leaves(model, dict(enumerate(jax.device_put(new))))
 
 
 class Free(eqx.Module):
@@ -53,15 +54,14 @@ class Free(eqx.Module):
         Raises:
             ValueError: the positions do not ascend.
         """
-        paths, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(model, eqx.is_inexact_array))
-        starts = np.cumsum([0] + [leaf.size for _, leaf in paths])
         positions = np.asarray(positions)
         if np.any(np.diff(positions) <= 0):
             raise ValueError("positions must ascend")
-        within = {i: positions[(positions >= a) & (positions < b)] - a for i, (a, b) in enumerate(pairwise(starts))}
-        leaves = tuple(i for i, e in within.items() if e.size)
-        parts = tuple(str(getattr(paths[i][0][0], "name", "")) for i in leaves)
-        return cls(leaves, parts, tuple(within[i] for i in leaves))
+        starts = np.cumsum([0] + [leaf.size for leaf in _leaves(model)])
+        ends = pairwise(np.searchsorted(positions, starts))
+        within = {i: positions[a:b] - starts[i] for i, (a, b) in enumerate(ends) if a < b}
+        fields = _fields(*_structure(model))
+        return cls(tuple(within), tuple(fields[i] for i in within), tuple(within.values()))
 
     def values(self, model: Model) -> list[Float[Array | np.ndarray, " _k"]]:
         """Free parameters of a model, leaf by leaf."""
@@ -88,11 +88,7 @@ class Free(eqx.Module):
 
     def put_whole(self, model: Model, whole: list[Float[Array, "..."]]) -> Model:
         """Copy of the model with these leaves."""
-        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-        leaves, treedef = jax.tree.flatten(arrays)
-        for i, leaf in zip(self.leaves, whole, strict=True):
-            leaves[i] = leaf
-        return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
+        return _with_leaves(model, dict(zip(self.leaves, whole, strict=True)))
 
     def get(self, model: Model) -> Float[Array | np.ndarray, " p"]:
         """Free parameters of a model as one vector."""
@@ -118,7 +114,34 @@ def value_and_jacobian(
 
 
 def _leaves(model: Model):
-    return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+    return [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+
+
+def _with_leaves(model: Model, new: dict[int, Float[Array, "..."]]) -> Model:
+    """Copy of the model with other floating-point leaves, by their numbers among these."""
+    leaves, structure = jax.tree.flatten(model)
+    floating = [i for i, leaf in enumerate(leaves) if eqx.is_inexact_array(leaf)]
+    for i, leaf in new.items():
+        leaves[floating[i]] = leaf
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _structure(model: Model) -> tuple[jax.tree_util.PyTreeDef, Shapes]:
+    """Structure of a model with the shapes of its floating-point leaves, None for others."""
+    leaves, structure = jax.tree.flatten(model)
+    return structure, tuple(leaf.shape if eqx.is_inexact_array(leaf) else None for leaf in leaves)
+
+
+def _paths(structure: jax.tree_util.PyTreeDef, shapes: Shapes) -> tuple[Model, list]:
+    """Model of zeros of this structure without its other leaves, and the paths of its leaves."""
+    model = jax.tree.unflatten(structure, [None if shape is None else np.zeros(shape) for shape in shapes])
+    return model, jax.tree_util.tree_flatten_with_path(model)[0]
+
+
+@cache
+def _fields(structure: jax.tree_util.PyTreeDef, shapes: Shapes) -> tuple[str, ...]:
+    """Field of the model that holds each floating-point leaf."""
+    return tuple(str(getattr(path[0], "name", "")) for path, _ in _paths(structure, shapes)[1])
 
 
 def _namespace(leaves):
@@ -152,15 +175,13 @@ class Parameter:
 
 def describe(model: Model) -> list[Parameter]:
     """Describe the entries of the flat vector, in order."""
-    leaves, structure = jax.tree.flatten(eqx.filter(model, eqx.is_inexact_array))
-    return list(_described(structure, tuple(leaf.shape for leaf in leaves)))
+    return list(_described(*_structure(model)))
 
 
 @cache
-def _described(structure, shapes: tuple[tuple[int, ...], ...]) -> tuple[Parameter, ...]:
+def _described(structure, shapes: Shapes) -> tuple[Parameter, ...]:
     """Describe the entries of any model of this structure; names and units do not depend on its numbers."""
-    model = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
-    paths, _ = jax.tree_util.tree_flatten_with_path(model)
+    model, paths = _paths(structure, shapes)
     entries = []
     for path, leaf in paths:
         keys = [getattr(k, "name", getattr(k, "idx", None)) for k in path]

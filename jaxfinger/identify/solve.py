@@ -6,16 +6,19 @@ with the prior's mean μ and precision Λ. A step of the solver needs the trials
 point. Each experiment is linearised by a program of its own, which all sessions of similar fingers share; the solver is
 stepped from Python (optimistix calls that interactive stepping). `batch` instead passes the same rows to
 `optimistix.least_squares` in one program, which is compiled for its sessions. An experiment whose residuals are affine
-in the free parameters is linearised once and then moved along its tangent, which is exact.
+in the free parameters is linearised once and then moved along its tangent, which is exact. Where all are, and no Huber
+cost bends theirs, the compressed rows of the start hold everywhere, and one call of the stepping program ends the fit.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.compilation import quick_jit, side_by_side
 from jaxfinger.errors import UserError
@@ -58,6 +61,10 @@ ROUGH_TOLERANCE = 0.02
 KINK_TOLERANCE = 0.1
 MAX_STEPS = 60  # linearisations; it bounds the time of a fit, whose report says when it was reached
 MIN_MASS_SHARE = 0.02  # lower bound of a mass over its starting value: no link is fifty times lighter than CAD says
+# Sentences of the outcomes. Python compares these; to compare the outcomes themselves is an operation of JAX's.
+RUNNING, CONVERGED, KINK, ROUNDED, UNDEFINED_START = (
+    Outcome[o] for o in (Outcome.running, Outcome.converged, Outcome.kink, Outcome.rounded, Outcome.undefined_start)
+)
 PADDING = 48  # problems are padded to a multiple of so many parameters, so that they share compiled programs
 
 
@@ -102,12 +109,33 @@ class Solution:
     message: str  # empty where the search converged
     linearisations: int
     cost: float  # ½ Σ s² of the white residuals under Huber's cost, without the prior
-    rows: int  # number of white residuals that are not zero
-    invisible: Float[np.ndarray, "k p"]  # unit vectors of scaled parameters along the invisible combinations
-    scale: Float[np.ndarray, " p"]  # unit of each scaled parameter
-    outliers: float  # share of white residuals beyond the robust limit
-    # At the optimum. Derivatives by parts of the model without a free parameter may be zero (`with_all_slopes`).
-    linearised: dict[str, Linearised]
+    jacobian: Float[np.ndarray, "k p"]  # of all trials and the prior, compressed, at the optimum
+    huber: float  # robust limit in standard deviations, 0 for none
+    linearise: Callable[[], dict[str, Linearised]]  # at the optimum
+
+    @cached_property
+    def invisible(self) -> Float[np.ndarray, "i p"]:
+        """Unit vectors of scaled parameters along the invisible combinations."""
+        return visible(self.jacobian)[1]
+
+    @cached_property
+    def linearised(self) -> dict[str, Linearised]:
+        """Every experiment, linearised at the optimum.
+
+        Derivatives by parts of the model without a free parameter may be zero (`with_all_slopes`).
+        """
+        return self.linearise()
+
+    @property
+    def rows(self) -> int:
+        """Number of white residuals that are not zero."""
+        return sum(int(np.count_nonzero(lin.white)) for lin in self.linearised.values())
+
+    @property
+    def outliers(self) -> float:
+        """Share of white residuals beyond the robust limit."""
+        beyond = sum(int(np.count_nonzero(np.abs(lin.white) > self.huber)) for lin in self.linearised.values())
+        return beyond / max(1, self.rows) if self.huber else 0.0
 
     @property
     def converged(self) -> bool:
@@ -150,7 +178,7 @@ class Tangents:
         along = along.moved(by) if by.any() else along
         of, under, there, white = self._white.get(name, (None, limit, values, None))
         if white is not None and of is source and under == limit:
-            white = white.moved(values - there, along.residuals, limit, source.weights)
+            white = white.moved(values - there, along, limit, source.weights)
         else:
             white = whitened(along, source.batch, source.filters, limit, source.weights, source.reversals)
         self._white[name] = source, limit, values, white
@@ -183,42 +211,40 @@ def solve(
     moved, theta, size = Free.at(model, free), flat[free], flat.size
     low, high = parameter_bounds(model, free, limits)
     prior = prior or Prior.none(theta)
-    least = np.asarray(tolerance)
+    affine = not huber and all(s.is_affine(model, free) for s in sources.values())
     room = -(-max(p, 1) // PADDING) * PADDING
     y = _padded(theta, room)
-    state = jax.device_get(_begin(y))
-    ends = _padded(low, room), _padded(high, room)
+    state = begin(y)
+    how = np.asarray(tolerance), np.asarray(affine), _padded(low, room), _padded(high, room)
     at, sizes = model, [np.inf]  # lengths of the full steps, in standard deviations
     for _ in range(MAX_STEPS):
         linearised = linearise_each(at, sources, huber, tangents, free)
         factor = stacked(linearised, sources, size)
-        offset = prior.root @ (state.trial[:p] - prior.mean)
+        offset = prior.root @ (np.asarray(state.trial)[:p] - prior.mean)
         rows = np.concatenate([factor[:, [*free, size]], np.column_stack([prior.root, offset])])
         trial = state.trial
         here = _factor_of(rows, room, _linear_rows(linearised, sources, free, size, huber))
-        y, state = jax.device_get(_advance(least, y, state, here, *ends))
+        y, state = _advance(y, state, here, *how)
         sizes.append(float(state.size))
-        if np.array_equal(y, trial):
-            best = at, linearised, factor, rows
-        if state.outcome == Outcome.undefined_start:
-            raise UserError(f"{Outcome[state.outcome]}: start from other parameters")
-        if not bool(state.outcome == Outcome.running):
+        if affine or np.array_equal(y, trial):
+            best = at, linearised, rows
+        outcome = Outcome[state.outcome]
+        if outcome == UNDEFINED_START:
+            raise UserError(f"{outcome}: start from other parameters")
+        if affine or outcome != RUNNING:
             break
-        at = moved.set(model, state.trial[:p])
-    model, linearised, factor, rows = best
-    _, invisible, scale = visible(rows[:, :-1])
-    white = np.concatenate([lin.white.ravel() for lin in linearised.values()])
-    count = int(np.count_nonzero(white))
-    return model, Solution(
+        at = moved.set(model, np.asarray(state.trial)[:p])
+    at, linearised, rows = best
+    y = np.asarray(y)[:p]
+    optimum = moved.set(model, y) if affine else at
+    return optimum, Solution(
         state.outcome,
-        _sentence(state, _way_left(sizes[-2], sizes[-1])),
+        _sentence(outcome, state, _way_left(sizes[-2], sizes[-1])),
         int(state.evaluations),
-        0.5 * float(factor[:, -1] @ factor[:, -1]),
-        count,
-        invisible,
-        scale,
-        float(np.count_nonzero(np.abs(white) > huber)) / max(1, count) if huber else 0.0,
-        linearised,
+        float(state.cost) - prior.cost(y),
+        rows[:, :-1],
+        huber,
+        partial(linearise_each, optimum, sources, huber, tangents, free) if affine else lambda: linearised,
     )
 
 
@@ -239,20 +265,20 @@ def _way_left(before: float, last: float) -> float:
     return last / (1.0 - last / before) if last < before else np.inf
 
 
-def _sentence(state: Iterate, left: float) -> str:
+def _sentence(outcome: str, state: Iterate, left: float) -> str:
     """Message to the user about a search that did not converge; empty where it did.
 
     `left`: the way to the optimum that full steps would go, in standard deviations.
     """
     step = float(state.length) * float(state.size)
-    near = bool(state.outcome == Outcome.running) and left <= KINK_TOLERANCE
-    at_rounding = bool(state.outcome == Outcome.rounded) and step <= KINK_TOLERANCE
-    if near or at_rounding or bool(state.outcome == Outcome.converged) or bool(state.outcome == Outcome.kink):
+    near = outcome == RUNNING and left <= KINK_TOLERANCE
+    at_rounding = outcome == ROUNDED and step <= KINK_TOLERANCE
+    if near or at_rounding or outcome in (CONVERGED, KINK):
         return ""
     last = f"the last step was {step:.2g} standard deviations"
-    if bool(state.outcome == Outcome.running):
+    if outcome == RUNNING:
         return f"no end after {MAX_STEPS} linearisations; {last}"
-    return f"{Outcome[state.outcome]}; {last}"
+    return f"{outcome}; {last}"
 
 
 def _padded(values: np.ndarray, room: int) -> Float[np.ndarray, " room"]:
@@ -291,12 +317,31 @@ def _linear_rows(
     return LinearRows(gram[np.ix_(free, free)], count)
 
 
-_begin = quick_jit(begin)
-
-
 @quick_jit
-def _advance(tolerance: Float[Array, ""], y, state: Iterate, here: Factor, low, high):
-    return VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE).advance(y, state, here, low, high)
+def _advance(
+    y: Float[Array, " p"],
+    state: Iterate,
+    here: Factor,
+    tolerance: Float[Array, ""],
+    affine: Bool[Array, ""],
+    low: Float[Array, " p"],
+    high: Float[Array, " p"],
+) -> tuple[Float[Array, " p"], Iterate]:
+    """Best point and state after one step; where the rows in `here` are `affine`, those at the end of the search."""
+    solver = VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE)
+
+    def step(carry):
+        y, state, here = carry
+        best, after = solver.advance(y, state, here, low, high)
+        return best, after, here._replace(d=here.d + here.R @ (after.trial - state.trial))
+
+    def goes_on(carry):
+        state = carry[1]
+        more = affine & (state.outcome == Outcome.running) & (state.evaluations < MAX_STEPS)
+        return more | (state.evaluations == first)
+
+    first = state.evaluations
+    return jax.lax.while_loop(goes_on, step, (y, state, here))[:2]
 
 
 def linearise_each(
