@@ -83,8 +83,10 @@ print(used.ru_utime + used.ru_stime, time.perf_counter() - begun, used.ru_maxrss
 def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
     """Processor seconds, wall seconds and peak MiB of five runs of `jaxfinger identify`, (runs, 3).
 
-    `cold`: each run has an empty compile cache. Otherwise a run before them fills a common one.
+    `cold`: each run has an empty compile cache. Otherwise a run before them fills a common one. Python keeps the
+    bytecode of the package, as it does by default; without it each run would compile all modules, too.
     """
+    inherited = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     command = [sys.executable, "-m", "jaxfinger", "identify", str(session), "-o", str(folder / "fit.json")]
     rows = []
     for run in range(RUNS if cold else RUNS + 1):
@@ -94,7 +96,7 @@ def measured(session: Path, folder: Path, cold: bool = False) -> np.ndarray:
             check=True,
             capture_output=True,
             text=True,
-            env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache},
+            env=inherited | {"JAX_COMPILATION_CACHE_DIR": cache},
         )
         rows.append([float(x) for x in line.stdout.split()])
     return np.array(rows[-RUNS:])

@@ -62,7 +62,7 @@ def in_rows(batch: Batch) -> Batch:
     (B, T), n = batch.x.time.shape, -(-batch.x.time.size // TRIALS)
 
     def rows(a, mode: Literal["edge", "constant"] = "edge"):
-        flat = np.reshape(a, (*np.shape(a)[:-2], B * T))
+        flat = np.asarray(a).reshape(*np.shape(a)[:-2], B * T)
         fill = np.pad(flat, [(0, 0)] * (flat.ndim - 1) + [(0, TRIALS * n - B * T)], mode)
         return fill.reshape(*flat.shape[:-1], TRIALS, n)
 

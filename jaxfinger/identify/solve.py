@@ -328,7 +328,7 @@ def _advance(
     high: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], Iterate]:
     """Best point and state after one step; where the rows in `here` are `affine`, those at the end of the search."""
-    solver = VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE)
+    solver, first = VisibleGaussNewton(atol=tolerance, kink=KINK_TOLERANCE), state.evaluations
 
     def step(carry):
         y, state, here = carry
@@ -336,11 +336,10 @@ def _advance(
         return best, after, here._replace(d=here.d + here.R @ (after.trial - state.trial))
 
     def goes_on(carry):
-        state = carry[1]
-        more = affine & (state.outcome == Outcome.running) & (state.evaluations < MAX_STEPS)
-        return more | (state.evaluations == first)
+        now = carry[1]
+        more = affine & (now.outcome == Outcome.running) & (now.evaluations < MAX_STEPS)
+        return more | (now.evaluations == first)
 
-    first = state.evaluations
     return jax.lax.while_loop(goes_on, step, (y, state, here))[:2]
 
 

@@ -19,6 +19,7 @@ Within about `1/cutoff_hz` of an end the results depend on the mirror image.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,15 +89,17 @@ def _smoothed(time: np.ndarray, x: np.ndarray, cutoff_hz: float, orders: tuple[i
         raise UserError(
             f"a cut-off of {cutoff_hz:g} Hz must lie between 0 and half the sampling rate, {0.5 * rate:.4g} Hz"
         )
-    columns = x.reshape(len(time), -1).T
+    columns = np.ascontiguousarray(x.reshape(len(time), -1).T)
     out, finite = np.full((len(orders), *columns.shape), np.nan), np.isfinite(columns)
     usable = np.flatnonzero(finite.sum(axis=1) >= 3)
     if usable.size:
         even = np.stack([_on_grid(time, columns[k], grid) for k in usable])
         coefficients = _spline(even, rate, cutoff_hz)
         at = None if grid is time else (time - grid[0]) * rate
-        out[:, usable] = rate ** np.array(orders)[:, None, None] * _derivatives(coefficients, orders, at)
-        out[:, ~finite] = np.nan
+        derivatives = _derivatives(coefficients, orders, at)
+        for order, of_order, values in zip(orders, out, derivatives, strict=True):
+            of_order[usable] = rate**order * values
+            of_order[~finite] = np.nan
     return np.moveaxis(out, 1, 2).reshape(len(orders), *x.shape)
 
 
@@ -111,11 +114,20 @@ def _spline(x: Float[np.ndarray, "k N"], rate: float, cutoff_hz: float) -> Float
     # A straight line is its own spline coefficients, so it is added back to them.
     line = wide[:, :1] + (wide[:, -1:] - wide[:, :1]) / (count - 1) * np.arange(count)
     size = fourier_length(count)
+    near = slice(reach - 2, reach + N + 3)
+    series = np.fft.rfft(wide - line, size) * _transfer(size, rate * filter_std(cutoff_hz))
+    return np.fft.irfft(series, size)[:, near] + line[:, near]
+
+
+@lru_cache(maxsize=16)
+def _transfer(size: int, std: float) -> Float[np.ndarray, " k"]:
+    """Factor of low-pass and spline on a Fourier series of `size` samples; `std`: of the Gaussian, in samples.
+
+    Trials of a session are mostly of a few lengths.
+    """
     turn = 2.0 * np.pi / size * np.arange(size // 2 + 1)  # rad from sample to sample
     B = _B_SPLINE[0, 2] + 2.0 * (_B_SPLINE[0, 3] * np.cos(turn) + _B_SPLINE[0, 4] * np.cos(2.0 * turn))
-    H = np.exp(-0.5 * (rate * filter_std(cutoff_hz) * turn) ** 2)
-    near = slice(reach - 2, reach + N + 3)
-    return np.fft.irfft(np.fft.rfft(wide - line, size) * (H / B), size)[:, near] + line[:, near]
+    return np.exp(-0.5 * (std * turn) ** 2) / B
 
 
 def _derivatives(
@@ -139,7 +151,8 @@ def _derivatives(
         near = coefficients[:, i : i + last + 1]
         near = near if before is None else near.take(before, axis=1)
         for derivative, weight in zip(out, weights, strict=True):
-            derivative += weight[i] * near
+            if weight[i].any():
+                derivative += weight[i] * near
     return out
 
 
