@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -126,20 +127,20 @@ def _with_leaves(model: Model, new: dict[int, Float[Array, "..."]]) -> Model:
     return jax.tree.unflatten(structure, leaves)
 
 
-def _structure(model: Model) -> tuple[jax.tree_util.PyTreeDef, Shapes]:
+def _structure(model: Model) -> tuple[Any, Shapes]:
     """Structure of a model with the shapes of its floating-point leaves, None for others."""
     leaves, structure = jax.tree.flatten(model)
     return structure, tuple(leaf.shape if eqx.is_inexact_array(leaf) else None for leaf in leaves)
 
 
-def _paths(structure: jax.tree_util.PyTreeDef, shapes: Shapes) -> tuple[Model, list]:
+def _paths(structure, shapes: Shapes) -> tuple[Model, list]:
     """Model of zeros of this structure without its other leaves, and the paths of its leaves."""
     model = jax.tree.unflatten(structure, [None if shape is None else np.zeros(shape) for shape in shapes])
     return model, jax.tree_util.tree_flatten_with_path(model)[0]
 
 
 @cache
-def _fields(structure: jax.tree_util.PyTreeDef, shapes: Shapes) -> tuple[str, ...]:
+def _fields(structure, shapes: Shapes) -> tuple[str, ...]:
     """Field of the model that holds each floating-point leaf."""
     return tuple(str(getattr(path[0], "name", "")) for path, _ in _paths(structure, shapes)[1])
 
