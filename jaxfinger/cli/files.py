@@ -92,17 +92,16 @@ def look(*recordings: Path, finger: Path | None = None, json: bool = False) -> N
     if not recordings:
         raise UserError("no recording was given; name at least one")
     from jaxfinger.data.finger_file import finger_from
+    from jaxfinger.data.importing.leverage import surveyed
     from jaxfinger.data.importing.proposal import proposal
     from jaxfinger.data.importing.sources import load_recording
-    from jaxfinger.data.importing.survey import clocks_of, columns_of, weight_on_reach
+    from jaxfinger.data.importing.survey import clocks_of
     from jaxfinger.data.signals.sizes import MAX_RATE
     from jaxfinger.data.toml import Place
 
     described = finger_from(str(finger.resolve()), Place(str(finger))) if finger is not None else None
     loaded = [load_recording(path) for path in recordings]
-    names = (described.joint_names, described.tendon_names) if described is not None else ()
-    weight = weight_on_reach(described)
-    surveys = [(recording, columns_of(recording, loaded, *names, weight=weight)) for recording in loaded]
+    surveys = list(zip(loaded, surveyed(loaded, described), strict=True))
     if json:
         print_json([_as_dict(recording, seen) for recording, seen in surveys])
         return

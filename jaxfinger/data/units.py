@@ -52,10 +52,20 @@ TO_SI = {
 }
 _SPELT = {"°": "deg", "度": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
-_SPELT |= {"degree": "deg", "radian": "rad", "radians": "rad", "turns": "turn", "revs": "turn", "revolutions": "turn"}
+_SPELT |= {
+    "deg": "deg",
+    "rad": "rad",
+    "degree": "deg",
+    "radian": "rad",
+    "radians": "rad",
+    "turns": "turn",
+    "revs": "turn",
+    "revolutions": "turn",
+}
 _SPELT |= {"revolution": "turn", "cycle": "turn", "cycles": "turn", "umdrehung": "turn", "umdrehungen": "turn"}
 _SPELT |= {"gons": "gon", "gradian": "gon", "gradians": "gon"}
 _SPELT |= {"second": "s", "seconds": "s", "days": "day", "newton": "N", "newtons": "N"}
+_SPELT |= {"meters": "m", "metres": "m", "meter": "m", "millimeters": "mm", "millimetres": "mm", "newton meters": "N m"}
 _SPELT |= {"secs": "s", "sek": "s", "sekunden": "s", "minute": "min", "minutes": "min", "hour": "h", "hours": "h"}
 _SPELT |= {"millis": "ms", "msec": "ms", "msecs": "ms", "milliseconds": "ms"}
 _SPELT |= {"micros": "us", "usec": "us", "usecs": "us", "microseconds": "us", "nsec": "ns", "nanoseconds": "ns"}
@@ -67,7 +77,8 @@ _FOREIGN = {
     "lbf", "lb", "lbs", "ozf", "oz", "g", "kg", "in", "inch", "inches", "ft", "psi", "bar", "pa", "kpa",
     "v", "mv", "mv/v", "a", "ma", "%", "rpm", "count", "counts", "cnt", "tick", "ticks", "pulses", "bit", "bits",
     "lsb", "raw", "kgfcm", "kgcm", "gfcm", "gcm", "ozin", "ozfin", "inoz", "inozf", "lbin", "lbfin", "inlb", "inlbf",
-    "lbft", "lbfft", "ftlb", "ftlbf", "danm",
+    "lbft", "lbfft", "ftlb", "ftlbf", "danm", "volt", "volts", "millivolts", "amp", "amps", "ampere", "amperes",
+    "pounds", "kilograms", "grams",
 }  # fmt: skip
 
 

@@ -33,6 +33,9 @@ _FRAME = re.compile(
     r"\s*(\([\d.]+\)\s+)?[a-z]+\d+\s+[0-9A-F]{3,8}(#|\s+\[\d+\])|\s*[\d.]+\s+\d+\s+[0-9A-F]+x?\s+[RT]x\s+d\s+\d",
     re.IGNORECASE,
 )
+# Lines in the header of a LabVIEW measurement file, with a cell for each column: the units of the values, and what the
+# times of the first column are.
+_LABVIEW_UNITS, _LABVIEW_TIMES = "Y_Unit_Label", "X_Dimension"
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -166,11 +169,14 @@ def _names(
     labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
     if _SCOPE in labelled and "Name" in labelled:
         return labelled["Name"], labelled.get("Unit", ("",) * width), True
+    labview = {row[0]: row for row in rows}
     words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
     units = ("",) * width
     if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
     names = tuple(words[0]) if words else ()
+    if _LABVIEW_UNITS in labview:
+        units = ("s" if "Time" in labview.get(_LABVIEW_TIMES, ()) else "", *labview[_LABVIEW_UNITS][1:])
     if len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
         names = tuple(".".join(filter(None, pair)) for pair in zip(words[1], names, strict=True))
     return names, units, False

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxfinger.data.importing.logs import Log
-from jaxfinger.data.importing.names import is_speed
+from jaxfinger.data.importing.names import is_before_a_gear, is_position, is_speed
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
@@ -74,6 +74,8 @@ def _doubt(seen: ColumnSurvey) -> str:
         return f"it states {seen.foreign}: {EITHER.get(seen.foreign.lower(), 'write `scale` too, or another unit')}"
     if seen.whole:
         return "whole numbers, as counts are: then write `scale` too"
+    if seen.meaning == "q" and (is_before_a_gear(seen.name) or is_position(seen.name)):
+        return "it may be in rad, in degrees or, as drives count, in turns; of a motor before a gear write `scale` too"
     return "its size does not tell"
 
 

@@ -42,6 +42,10 @@ _SET_POINT = (
     r"|(?<![a-z])d*(q|theta|tau|tau_j)_d(?![a-z])"
     r"|(?<![a-z])(q|tau|pos)?(des|set(?!\d+\.)|sp|ff|tgt|nominal|planned)(?![a-z])"
 )
+# Names of what is in front of a joint's gear or spring, and of positions as drives and encoders count them.
+MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
+_OF_DRIVE = r"pos_?(estimate|cpr|circular)|odrv|odrive|moteus"
+_POSITION = r"(?<![a-z])(pos(ition)?|enc(oder)?)(?![a-z])"
 _SI_UNITS = {
     "time": ("s",),
     "temperature": ("K",),
@@ -83,6 +87,16 @@ def as_word(name: str) -> re.Pattern[str]:
 def is_nameless(name: str) -> bool:
     """Whether a column has no name in its recording, so that its values alone say what it may be."""
     return re.fullmatch(_NAMELESS, name.lower()) is not None
+
+
+def is_before_a_gear(name: str) -> bool:
+    """Whether a column is of a motor by its name, so that a gear may be between it and the joint."""
+    return re.search(f"{MOTOR}|{_OF_DRIVE}", words(name)) is not None
+
+
+def is_position(name: str) -> bool:
+    """Whether a name says no more than that a drive or an encoder counts a position: not that it is a joint's angle."""
+    return re.search(_POSITION, words(name)) is not None and "joint" not in name.lower()
 
 
 def is_speed(name: str) -> bool:

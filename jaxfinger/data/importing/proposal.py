@@ -11,6 +11,7 @@ import numpy as np
 from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
 from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.experiment import guessed_experiment
+from jaxfinger.data.importing.leverage import surveyed
 from jaxfinger.data.importing.lines import (
     called,
     column_line,
@@ -21,16 +22,14 @@ from jaxfinger.data.importing.lines import (
     turns_line,
 )
 from jaxfinger.data.importing.logs import Log, trials_of
-from jaxfinger.data.importing.names import is_nameless, is_set_point, words
+from jaxfinger.data.importing.names import MOTOR, is_nameless, is_set_point, words
 from jaxfinger.data.importing.recording import Recording
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, weight_on_reach
+from jaxfinger.data.importing.survey import ColumnSurvey, weight_on_reach
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import beyond_a_turn
 from jaxfinger.errors import counted, listed
 
-# Names of what is in front of a joint's gear or spring.
-_MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
 # Where a log has both, q is a joint's angle, and theta that of the motor in front of its elastic gear.
 _LINK, _MOTOR_BESIDE_LINK = r"(?<![a-z])q(?![a-z])", r"(?<![a-z])theta(?![a-z])"
 _MAX_LEFT_OUT = 12  # variables that are named, so that the line of a large bag stays readable.
@@ -47,10 +46,8 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     where names do not match. Without a finger, joints and tendons are named as in the recordings. Channels that all
     recordings map alike are shared. `head` holds the lines of specimen and finger.
     """
-    names = (finger.joint_names, finger.tendon_names) if finger is not None else ()
     weight = weight_on_reach(finger)
-    seen = [columns_of(recording, recordings, *names, weight=weight) for recording in recordings]
-    trials = trials_of([Log(*pair) for pair in zip(recordings, seen, strict=True)])
+    trials = trials_of([Log(*pair) for pair in zip(recordings, surveyed(recordings, finger), strict=True)])
     proposed = [_trial_proposal(logs, finger, weight) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
@@ -220,7 +217,7 @@ def _families(columns: Sequence[ColumnSurvey], count: int, known: Sequence[str])
 
 def _is_motor(seen: ColumnSurvey) -> bool:
     """Whether a column's name says that it belongs to a motor: where the joint has columns of its own, these count."""
-    return _has(_MOTOR, seen)
+    return _has(MOTOR, seen)
 
 
 def _has(pattern: str, seen: ColumnSurvey) -> bool:

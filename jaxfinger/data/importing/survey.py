@@ -10,7 +10,16 @@ import numpy as np
 
 from jaxfinger.data.example import is_example
 from jaxfinger.data.importing.columns import coarse_rate, restarts
-from jaxfinger.data.importing.names import Owners, as_word, is_joint, is_nameless, meaning_of, words
+from jaxfinger.data.importing.names import (
+    Owners,
+    as_word,
+    is_before_a_gear,
+    is_joint,
+    is_nameless,
+    is_position,
+    meaning_of,
+    words,
+)
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.mounting import reach_of, weight_of
 from jaxfinger.data.session import FingerDescription
@@ -22,23 +31,25 @@ MIN_GAP = 5.0
 # Share of a clock's steps that its usual one is not twice or half of.
 _MIN_EVEN = 0.9
 # Largest plausible values of a channel by unit, with room for arms. The first unit whose largest value is not exceeded
-# is the guess. Torques from 0.2 to 500 may be an arm's in N m or a finger's in N mm, and large tensions may be in mN or
-# gf, so their unit stays open. A link of 1 g weighs 0.2 N mm at 2 cm. The finger's own weight tells more of torques.
+# is the guess; sizes that are usual in several units leave it open. Torques from 0.2 to 500 may be an arm's in N m or a
+# finger's in N mm, and a link of 1 g weighs 0.2 N mm at 2 cm. The finger's own weight tells more of torques. Tensions
+# up to 15 may be in kgf, or volts of a load cell, and those above 100 in gf; so may smaller forces at the fingertip.
+# Travel from 0.1 to 8 may be in cm. Moment arms tell more of all these (`leverage`).
 _MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
     "joint_torque": (("N m", 0.2), ("", 500.0), ("N mm", 5e3)),
-    "tendon_force": (("N", 500.0), ("", 1e6)),
-    "tendon_excursion": (("m", 0.2), ("mm", 200.0)),
-    "fingertip_force": (("N", 100.0), ("mN", 1e5)),
+    "tendon_force": (("", 15.0), ("N", 100.0), ("", 1e6)),
+    "tendon_excursion": (("m", 0.1), ("", 8.0), ("mm", 200.0)),
+    "fingertip_force": (("", 0.5), ("N", 20.0), ("", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
 # Angles that are never larger may be turns, in which some motor drives count: no joint of a finger turns by more than
 # 110°. In rad they would be 17° at most, which is little for a recording.
 _MAX_TURNS = 0.3
 # Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
-# since in N mm they would be a hundredth of it, less than any load moves them. Larger ones than the second are in N mm:
-# `check` refuses them in N m. Between them the unit stays open.
-_WEIGHTS = 10.0, 200.0
+# since in N cm or N mm they would be a few hundredths of it, less than any load moves them. Larger ones than the second
+# are in N mm: `check` refuses them in N m. Between them the unit stays open.
+_WEIGHTS = 3.0, 200.0
 _MIN_DATE = 1e4  # days: spreadsheets count them from 1900, and MATLAB from the year 0.
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
 _INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
@@ -117,6 +128,9 @@ def columns_of(
             if not (units or foreign or counts):
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
+                units = (
+                    "" if meaning == "q" and finite.any() and _may_be_geared(name, variable, units, owners) else units
+                )
                 guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
@@ -129,6 +143,15 @@ def columns_of(
                 found[k] = replace(s, meaning="time", units=s.units or _time_unit(x))
                 break
     return found
+
+
+def _may_be_geared(name: str, variable: Variable, units: str, owners: Owners) -> bool:
+    """Whether angles without a stated unit may be of a motor before its gear, in any unit, or counted in turns.
+
+    Positions of a joint, as those of a JointState, are in rad.
+    """
+    of_joint = variable.columns or owners.of(words(name))[0]
+    return is_before_a_gear(name) or (units == "rad" and is_position(name) and not of_joint)
 
 
 def _is_no_unit(stated: str, owners: Owners) -> bool:

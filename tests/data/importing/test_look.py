@@ -220,7 +220,7 @@ def test_a_unit_is_guessed_from_all_recordings_of_a_column(tmp_path):
     logs = []
     for name, angle in (("held", np.full(len(GAPPED_MS), 5.7)), ("moved", 40.0 - 40.0 * np.cos(GAPPED_MS / 1e3))):
         logs.append(tmp_path / f"{name}.csv")
-        np.savetxt(logs[-1], np.column_stack([GAPPED_MS, angle]), "%.6f", ",", header="t,enc", comments="")
+        np.savetxt(logs[-1], np.column_stack([GAPPED_MS, angle]), "%.6f", ",", header="t,angle", comments="")
     recordings = [load_recording(log) for log in logs]
     assert columns_of(recordings[0])[1].units == "rad"
     assert columns_of(recordings[0], recordings)[1].units == "deg"

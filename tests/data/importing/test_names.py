@@ -31,7 +31,7 @@ def seen(tmp_path, columns, units=(), **names):
         ({"knuckle_angle": 80.0, "end_angle": 5.0}, ("knuckle", "end"), ["deg", "deg"]),
         ({"knuckle_angle": 80.0, "end_angle": 5.0}, (), ["", ""]),
         ({"tau_raw": 900.0, "tau_bridge": 0.4}, (), ["", ""]),
-        ({"angle": 80.0, "enc": 5.0}, (), ["deg", "rad"]),
+        ({"angle": 80.0, "theta": 5.0}, (), ["deg", "rad"]),
     ],
     ids=["words", "capitals", "known joints", "half of them", "raw", "no word in common"],
 )
@@ -88,7 +88,7 @@ def test_a_clock_shows_by_its_units_where_no_name_says_so(tmp_path, name, stated
         tmp_path, {"enc": MOVED, "latency": np.random.default_rng(0).uniform(size=1000)}, {"latency": "ms"}
     )
     assert clocks_of(late, columns_of(late)) == []
-    assert seen(tmp_path, {"F_min": MOVED})["F_min"] == ("tendon_force", "N")
+    assert seen(tmp_path, {"F_min": MOVED})["F_min"] == ("tendon_force", "")
 
 
 @pytest.mark.parametrize(

@@ -163,3 +163,14 @@ def test_what_is_not_read_is_told_how_to_be_written(tmp_path, name, mend):
     (tmp_path / name).write_bytes(b"\x00\x01")
     with pytest.raises(UserError, match=mend):
         load_recording(tmp_path / name)
+
+
+def test_labview_states_units_in_its_header(tmp_path):
+    """Above the line of names, with the unit of times by the dimension of x; volts are no unit of a force."""
+    head = LVM.replace("X0\t", "Y_Unit_Label\tDeg\tVolts\t\nX_Dimension\tTime\tTime\t\nX0\t")
+    found = written(tmp_path, "{t:.2f}\t{a}\t{f}", head, "log.lvm")
+    assert {name: v.units for name, v in found.variables.items()} == {"X_Value": "s", "angle": "Deg", "force": "Volts"}
+    said = proposal([found])
+    assert 'time = "X_Value"' in said
+    assert 'from = "angle", units = "deg" }' in said
+    assert 'from = "force", units = "?" }   # it states Volts: write `scale` too' in said

@@ -1,5 +1,6 @@
 """Units of a log's columns: stated ones are read or asked for, and a size that fits several units is asked for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
 from jaxfinger.data.importing.survey import columns_of
 from jaxfinger.errors import UserError
-from tests.data.conftest import ONE_JOINT
+from tests.data.conftest import ONE_JOINT, make_finger
 
 TIME = np.arange(400) / 100
 SWEEP = 0.5 + 0.4 * np.sin(TIME)  # rad
@@ -60,7 +61,7 @@ def test_times_in_an_unknown_unit_are_asked_for(tmp_path):
 @pytest.mark.parametrize(("turns", "units"), [(1.0, "rad"), (2 * np.pi, "?")])
 def test_angles_so_small_that_they_may_be_turns_are_asked_for(tmp_path, turns, units):
     """A joint that is held at a small angle takes the unit of the one that moves."""
-    path = log(tmp_path, "time [s],pos_1,pos_2", SWEEP / turns, np.full(len(TIME), 0.1))
+    path = log(tmp_path, "time [s],q_1,q_2", SWEEP / turns, np.full(len(TIME), 0.1))
     assert [s.units or "?" for s in columns_of(load_recording(path))[1:]] == [units, units]
 
 
@@ -147,3 +148,84 @@ def test_a_unit_that_ends_a_name_contradicts_a_mapping_with_another(tmp_path):
     )
     import_session([path], tmp_path / "m.toml", report)
     assert 'states kg, and the mapping reads N; write units = "kgf"' in str([f.message for f in report])
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "units"),
+    [
+        ("axis0.encoder.pos_estimate", 2.0, "?"),  # turns of a motor before its gear
+        ("motor_pos", 300.0, "?"),
+        ("position", 1.0, "?"),
+        ("encoder", 1.0, "?"),
+        ("encoder", 60.0, "deg"),
+        ("joint_pos", 1.0, "rad"),
+        ("q", 1.0, "rad"),
+        ("motor_pos [deg]", 300.0, "deg"),
+    ],
+)
+def test_a_position_that_may_be_of_a_motor_or_in_turns_is_asked_for(tmp_path, name, size, units):
+    said = line(log(tmp_path, f"time [s],{name}", size * SWEEP), "q")
+    assert f'units = "{units}"' in said
+    assert ("of a motor before a gear write `scale` too" in said) == (units == "?")
+
+
+@pytest.mark.parametrize(
+    ("angle", "speed", "name", "units"),
+    [
+        (1.0, 1.0, "vel", "?"),  # a speed in the units of its angle tells nothing
+        (1.0, 180 / np.pi, "vel", "rad"),
+        (1.0, 1.0, "vel [rad/s]", "rad"),
+        (1.0, 60 / (2 * np.pi), "speed_rpm", "rad"),
+        (1 / (2 * np.pi), 60 / (2 * np.pi), "vel [rpm]", "?"),  # turns, of a motor perhaps
+        (3.0, 1.0, "vel [rad/s]", "?"),  # through a gear
+        (180 / np.pi, 1.0, "vel", "deg"),
+    ],
+)
+def test_a_speed_tells_the_unit_of_its_angle(tmp_path, angle, speed, name, units):
+    path = log(tmp_path, f"time [s],position,{name}", angle * SWEEP, speed * 0.4 * np.cos(TIME))
+    assert f'units = "{units}"' in line(path, "q")
+
+
+def test_a_speed_through_a_gear_opens_the_unit_that_a_size_told(tmp_path):
+    path = log(tmp_path, "time [s],q,dq [rad/s]", SWEEP / 2.0, 0.4 * np.cos(TIME))
+    assert 'units = "?"' in line(path, "q")
+
+
+@pytest.mark.parametrize(
+    ("arm", "units"), [(8.0, "mm"), (0.8, "?"), (0.008, "m"), (0.315, "?"), (3.0, "?"), (12.0, "mm"), (100.0, "?")]
+)
+def test_the_travel_of_a_tendon_is_in_the_unit_that_makes_moment_arms(tmp_path, arm, units):
+    """Of cm and inches either would fit, and of small arms either of mm and cm."""
+    path = log(tmp_path, "time [s],q,excursion", SWEEP, arm * SWEEP)
+    assert f'units = "{units}"' in line(path, "tendon_excursion")
+
+
+def test_known_moment_arms_tell_centimetres(tmp_path):
+    finger = replace(make_finger(), joint_names=("J1", "J2"), tendon_names=("T1", "T2", "T3"))
+    path = log(tmp_path, "time [s],q1,q2,excursion 1", SWEEP, 0.0 * SWEEP, 0.8 * SWEEP)
+    said = proposal([load_recording(path)], finger)
+    assert 'channels.tendon_excursion.T1 = { from = "excursion 1", units = "cm" }' in said
+
+
+@pytest.mark.parametrize(("size", "units"), [(1.0, "?"), (14.0, "?"), (40.0, "N"), (400.0, "?"), (5000.0, "?")])
+def test_a_tension_of_any_size_that_people_use_in_two_units_is_asked_for(tmp_path, size, units):
+    path = log(tmp_path, "time [s],q,tension", SWEEP, size * (0.6 + 0.4 * np.cos(TIME)))
+    assert f'units = "{units}"' in line(path, "tendon_force")
+
+
+@pytest.mark.parametrize(
+    ("torque", "tension", "units"),
+    [(8.0, 1.0, "N"), (78.0, 1.0, "kgf"), (36.0, 1.0, "?"), (0.078, 100.0, "gf"), (8000.0, 0.01, "?")],
+)
+def test_a_known_torque_at_a_held_joint_tells_the_unit_of_the_tension(tmp_path, torque, tension, units):
+    pull = 6.0 + 5.0 * np.sin(TIME)
+    held = 0.5 + 0.0 * TIME
+    path = log(tmp_path, "time [s],q,tension,torque [N mm]", held, tension * pull, -torque * tension * pull)
+    assert f'units = "{units}"' in line(path, "tendon_force")
+
+
+@pytest.mark.parametrize(("torque", "units"), [(8.0, "N mm"), (0.8, "N cm"), (0.008, "N m"), (0.08, "?")])
+def test_a_known_tension_at_a_held_joint_tells_the_unit_of_the_torque(tmp_path, torque, units):
+    pull = 6.0 + 5.0 * np.sin(TIME)
+    path = log(tmp_path, "time [s],q,tension [N],torque", 0.5 + 0.0 * TIME, pull, -torque * pull)
+    assert f'units = "{units}"' in line(path, "joint_torque")
