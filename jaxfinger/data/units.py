@@ -106,14 +106,16 @@ def stated_units(name: str) -> str:
 def spelt(name: str) -> str:
     """Unit that ends a name such as `stamp_ms`, `force_kg` or `torque_N_mm`, as it is spelt there; empty without one.
 
-    No single letter is taken for one but the g of a force, nor words that have another meaning there.
+    Of single letters N is taken for one, but not of counts, and the g of a force. Words with another meaning there are
+    not.
     """
     *before, last = re.split(r"[\s_./]+", name.strip())
     pair = f"{before[-1]} {last}" if len(before) > 1 else ""
     if is_foreign(pair) or (unit_name(pair) and TO_SI[unit_name(pair)].si == "N m"):
         return pair
     of_force = last == "g" and re.match(r"f(_|orce)|load|tension", name.lower()) is not None
-    known = (len(last) > 1 and last not in _NO_UNITS and (unit_name(last) or is_foreign(last))) or of_force
+    newtons = last == "N" and re.search(r"sample|count|num|index|id$", "_".join(before).lower()) is None
+    known = (len(last) > 1 and last not in _NO_UNITS and (unit_name(last) or is_foreign(last))) or of_force or newtons
     return last if before and known else ""
 
 

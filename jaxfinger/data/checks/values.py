@@ -16,7 +16,7 @@ from jaxfinger.data.signals.motion import MIN_MOTION
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
-from jaxfinger.data.units import conversion, limits_of_turns, whole_turns
+from jaxfinger.data.units import TO_SI, conversion, limits_of_turns, whole_turns
 from jaxfinger.errors import counted, listed
 
 if TYPE_CHECKING:
@@ -131,7 +131,11 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
             mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
             report.error(place, f"{where}, more than a turn; {mend}")
         elif outside:
-            message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; correct one or the other"
+            message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; "
+            # The angle between two links is half a turn where they are straight, and falls as the joint flexes.
+            between = lower - _MAX_OVERTRAVEL <= np.pi - high and np.pi - low <= upper + _MAX_OVERTRAVEL
+            straight = "if it is 180 degrees where the finger is straight, write scale = -1.0 and offset = 180.0 (deg)"
+            message += f"{straight}, or else correct its zero or the limits" if between else "correct one or the other"
             report.warning(place, message)
 
 
@@ -170,16 +174,17 @@ def _large_for_the_machine(trial: Trial, finger: FingerDescription, sizes: Sizes
     if any(finger.prismatic):
         return
     reach = reach_of(finger)
-    for channel, most, unit in (
-        ("tendon_excursion", _MAX_EXCURSION * reach, "mm"),
-        ("joint_torque", max(_MAX_TORQUE * weight_of(finger), sizes.tension) * reach, "N mm"),
+    for channel, most, unit, larger in (
+        ("tendon_excursion", _MAX_EXCURSION * reach, "mm", "cm"),
+        ("joint_torque", max(_MAX_TORQUE * weight_of(finger), sizes.tension) * reach, "N mm", "N cm"),
     ):
         for _, name, x in measured_columns(trial, finger, (channel,)) if most != 0.0 else ():
             if np.isfinite(x).all() and (size := quantile(np.abs(x), 0.9)) > most:
+                other = f", or {conversion(larger)}" if TO_SI[larger].factor * size < most else ""
                 report.error(
                     trial.place(channel),
                     f"column {name} is of size {size:.3g}, too large for the lengths and masses of this machine; "
-                    f"{conversion(unit)}",
+                    f"{conversion(unit)}{other}",
                 )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxfinger.data.importing import labview
 from jaxfinger.data.importing.dialect import MISSING, Dialect, find_dialect
 from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
@@ -33,9 +34,6 @@ _FRAME = re.compile(
     r"\s*(\([\d.]+\)\s+)?[a-z]+\d+\s+[0-9A-F]{3,8}(#|\s+\[\d+\])|\s*[\d.]+\s+\d+\s+[0-9A-F]+x?\s+[RT]x\s+d\s+\d",
     re.IGNORECASE,
 )
-# Lines in the header of a LabVIEW measurement file, with a cell for each column: the units of the values, and what the
-# times of the first column are.
-_LABVIEW_UNITS, _LABVIEW_TIMES = "Y_Unit_Label", "X_Dimension"
 _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of times in ms beside each channel
 
 
@@ -71,7 +69,8 @@ def load_csv(path: Path) -> Recording:
     first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
     above = [line for line in lines if line.number < body[first].number]
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
-    names, units, scope = _names(above, dialect, len(numeric), blank=not any(row[-1] for row in rows))
+    blank = not any(row[-1] for row in rows)
+    names, units, scope = _names(above, dialect, len(numeric), blank)
     states = None if names else joint_states(rows, dialect.number)
     before = split(body[first - 1].text) if first > 0 else []
     # A recording may begin within a line, or after a message of the board.
@@ -100,7 +99,11 @@ def load_csv(path: Path) -> Recording:
         return _pairs(path, columns, names, units)
     degrees = _IN_DEGREES.search("\n".join(line.text for line in above))
     angles = _ANGLES[degrees[1].lower()] if degrees else ""
-    return replace(_named(path, columns, names, units, remarks), angles=angles)
+    recording = replace(_named(path, columns, names, units, remarks), angles=angles)
+    if labview.TIMES not in names and not any(name.endswith(".time") for name in names):
+        return recording
+    header = {row[0]: row for row in _heads(above, dialect, len(numeric), blank)}
+    return labview.timed(recording, header, dialect.number)
 
 
 def _without_words(
@@ -153,6 +156,25 @@ def _names(
     behind a comment mark (numpy.savetxt, gnuplot). Either they or the numbers may end with a separator, after which the
     last column is `blank`.
     """
+    rows = _heads(above, dialect, width, blank)
+    labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
+    if _SCOPE in labelled and "Name" in labelled:
+        return labelled["Name"], labelled.get("Unit", ("",) * width), True
+    header = {row[0]: row for row in rows}
+    words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
+    units = ("",) * width
+    if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
+        units = tuple(cell.strip("[]()") for cell in words.pop(0))
+    names = tuple(words[0]) if words else ()
+    if labview.UNITS in header and names[:1] == (labview.TIMES,):
+        names, units = labview.columns(names, header)
+    elif len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
+        names = tuple(".".join(filter(None, pair)) for pair in zip(words[1], names, strict=True))
+    return names, units, False
+
+
+def _heads(above: Sequence[Line], dialect: Dialect, width: int, blank: bool) -> list[list[str]]:
+    """Cells of the lines above the numbers that have one for each column, the nearest first."""
     rows = []
     for line in reversed(above):
         text = line.text.strip()
@@ -166,20 +188,7 @@ def _names(
             cells.append("")
         if len(cells) == width and any(cells):
             rows.append(cells)
-    labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
-    if _SCOPE in labelled and "Name" in labelled:
-        return labelled["Name"], labelled.get("Unit", ("",) * width), True
-    labview = {row[0]: row for row in rows}
-    words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
-    units = ("",) * width
-    if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
-        units = tuple(cell.strip("[]()") for cell in words.pop(0))
-    names = tuple(words[0]) if words else ()
-    if _LABVIEW_UNITS in labview:
-        units = ("s" if "Time" in labview.get(_LABVIEW_TIMES, ()) else "", *labview[_LABVIEW_UNITS][1:])
-    if len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
-        names = tuple(".".join(filter(None, pair)) for pair in zip(words[1], names, strict=True))
-    return names, units, False
+    return rows
 
 
 def _is_unit(cell: str) -> bool:

@@ -32,6 +32,7 @@ _MIN_TURN, _MAX_YIELD = 0.2, 0.05  # rad: a joint that turns, and one that is he
 _MIN_SHARE = 0.2  # of the largest change among tensions: smaller ones do not tell an arm
 _MIN_EXPLAINED = 0.9  # of a column's variance: with less, something else than a lever moves it
 _MIN_SAMPLES = 30
+_MAX_RATIO = 200.0  # of travels in one unit; between m and mm it is a thousand
 _MIN_SINGULAR = 0.1  # of the largest singular value: joints that only turn together share their arms
 
 
@@ -48,8 +49,9 @@ def by_arms(
 ) -> list[list[ColumnSurvey]]:
     """Surveys of the columns of some recordings of one finger, with the units that its moment arms tell.
 
-    They tell those of columns for which neither the recording nor a name states one, and of a channel's columns alike.
-    A guess from sizes is dropped where it contradicts them, and stays where nothing moves that tells an arm.
+    They tell those of columns for which neither the recording nor a name states one, and of a channel's columns alike;
+    but travels that are hundreds of times smaller than others may be in another unit, and stay open. A guess from sizes
+    is dropped where it contradicts them, and stays where nothing moves that tells an arm.
     """
     surveys = [list(columns) for columns in seen]
     for channel, units in _UNITS.items():
@@ -60,7 +62,10 @@ def by_arms(
         power = -1.0 if channel == "tendon_force" else 1.0
         fitting = [unit for unit, factor in units.items() if low < max(slopes) * factor**power < high]
         unit = fitting[0] if len(fitting) == 1 and fitting[0] in TO_SI else ""
-        surveys = [[replace(s, units=unit) if _is_open(s, channel) else s for s in columns] for columns in surveys]
+        open_ = [s for columns in surveys for s in columns if _is_open(s, channel)]
+        least = max(s.high - s.low for s in open_) / _MAX_RATIO if channel == "tendon_excursion" else 0.0
+        told = {s: replace(s, units=unit if s.high - s.low >= least else "") for s in open_}
+        surveys = [[told.get(s, s) for s in columns] for columns in surveys]
     return surveys
 
 

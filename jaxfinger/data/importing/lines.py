@@ -54,9 +54,9 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
     return "{ " + ", ".join(parts) + " }" + (f"   # {'; '.join(doubts)}" if doubts else "")
 
 
-def time_line(clock: ColumnSurvey) -> str:
-    """Line that reads the times of a trial."""
-    units = _units_of_clock(clock)
+def time_line(clock: ColumnSurvey, period: int = 0) -> str:
+    """Line that reads the times of a trial, of a clock that wraps after `period` counts if that is not 0."""
+    units = _units_of_clock(clock) + (f", unwrap = {period}" if period else "")
     name = quoted(clock.name)
     said = f"   # {_doubt(clock)}" if clock.foreign else ""
     return f"time = {{ from = {name}{units} }}{said}" if units else f"time = {name}"
@@ -137,6 +137,28 @@ def pace_line(log: Log, angles: Sequence[ColumnSurvey]) -> list[str]:
         for rate in _USUAL_RATES
     ]
     return [f"# {len(count)} samples: {'; '.join(said)}"]
+
+
+def transposed_lines(log: Log) -> list[str]:
+    """Comments on arrays with as many columns as the log has samples."""
+    samples = log.clock.samples if log.clock is not None else 0
+    arrays = [(name, v.values) for name, v in log.recording.variables.items()]
+    return [
+        f"# {quoted(name)} is {len(x)} by {samples}, joints first: transpose it, and save it again"
+        for name, x in arrays
+        if x.ndim == 2 and len(x) < samples == x.shape[1]
+    ]
+
+
+def elsewhere_lines(log: Log) -> list[str]:
+    """Comments on a log without angles at the times of none that has them: its clock may have begun elsewhere."""
+    if log.clock is None:
+        return []
+    return [
+        "# it holds no angles, and no log that does shares its times. If it belongs to another trial, and its clock",
+        f"# began elsewhere, write its columns there, each with file = {quoted(log.recording.path.name)} and time =",
+        f"# {{ from = {quoted(log.clock.name)}, offset = … }}, what is to be added to its times for those of the trial",
+    ]
 
 
 def called(seen: ColumnSurvey) -> str:

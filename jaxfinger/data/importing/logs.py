@@ -16,6 +16,8 @@ from jaxfinger.data.units import TO_SI, spelt_unit
 # Of the time of two logs: with more in common they show one trial. Loggers that are started by hand begin and end a
 # little apart.
 _TOGETHER = 0.9
+_PERIODS = 2**32, 2**16  # counts of a clock that wraps
+_MAX_LOST = 100.0  # samples that may be lost where a clock wraps
 _MIN_REPEATED = 0.9  # of the samples with the stamp of the one before: with its values too they are no other samples.
 
 
@@ -58,6 +60,19 @@ class Log:
 
     def _runs_back(self, clock: ColumnSurvey) -> bool:
         return bool(np.any(np.diff(np.ravel(self.recording.variables[clock.name].values)) < 0.0))
+
+    @cached_property
+    def period(self) -> int:
+        """Counts after which its clock wraps, as those of 32 and 16 bits do; 0 where it does not."""
+        if self.clock is None:
+            return 0
+        ticks = np.ravel(self.recording.variables[self.clock.name].values)
+        steps = np.diff(ticks)
+        back, usual = steps[steps < 0.0], float(np.median(steps))
+        for period in _PERIODS if len(back) and usual > 0.0 else ():
+            if np.all((back + period > 0.0) & (back + period < _MAX_LOST * usual)) and np.nanmax(ticks) < period:
+                return period
+        return 0
 
     @property
     def count(self) -> int:

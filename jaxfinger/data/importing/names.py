@@ -35,7 +35,7 @@ _NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what t
 # Name of a column of a table without names, or one that says no more: programs that draw curves call times x.
 _NAMELESS = r"column \d+|x([ _-]?(value|axis)s?)?"
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
-_VELOCITY = r"(?<![a-z])vel|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
+_VELOCITY = r"(?<![a-z])q?(vel|acc)|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)|collision|joint_contact"
 _SET_POINT = (
     r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
@@ -113,6 +113,7 @@ def meaning_of(name: str, column: str | int | None, x: np.ndarray, stated: str, 
     units = unit_name(stated) or spelt_unit(name)
     *before, word = re.split(r"[./]", without_units(name))
     word = before.pop() if before and word.lower() in _NO_WORDS else word
+    word = re.sub(r"(?<=[a-zA-Z0-9])_[Nm]$", "", word)  # newtons; metres or «measured»
     owner, rest = owners.of(words(word))
     rest = rest or (words(before[-1]) if before else "")
     texts = [word.lower(), *([f"{rest}_{owner}", rest] if owner and rest else [])]

@@ -15,10 +15,12 @@ from jaxfinger.data.importing.leverage import surveyed
 from jaxfinger.data.importing.lines import (
     called,
     column_line,
+    elsewhere_lines,
     pace_line,
     rate_by_speeds,
     time_line,
     torque_line,
+    transposed_lines,
     turns_line,
 )
 from jaxfinger.data.importing.logs import Log, trials_of
@@ -27,7 +29,7 @@ from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.survey import ColumnSurvey, weight_on_reach
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
-from jaxfinger.data.units import beyond_a_turn
+from jaxfinger.data.units import TO_SI, beyond_a_turn
 from jaxfinger.errors import counted, listed
 
 # Where a log has both, q is a joint's angle, and theta that of the motor in front of its elastic gear.
@@ -68,8 +70,10 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
         for log in logs:
+            lines += transposed_lines(log)
             unread = [f"# {quoted(name)} {reason}" for name, reason in log.recording.unusable.items()]
             lines += unread[:_MAX_LEFT_OUT]
+        lines += elsewhere_lines(logs[0]) if "q" not in trial.channels and len(trials) > 1 else []
         for what, said in ((False, "in no channel yet"), (True, "set-points by their names, which are not measured")):
             named = [quoted(name) for name in trial.left_out if is_set_point(name) == what]
             lines += [f"# {said}: {listed(named, _MAX_LEFT_OUT)}"] if named else []
@@ -121,7 +125,11 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     coarse = None if logs[0].repeats else coarse_rate(time)
-    guessed = "   # guessed: its values rise evenly" if clock is not None and is_nameless(clock.name) else ""
+    guessed = (
+        "   # guessed: its values rise evenly"
+        if clock is not None and is_nameless(clock.name) and not clock.stated
+        else ""
+    )
     if clock is not None and logs[0].counts(clock):
         guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"
     if clock is None:
@@ -130,7 +138,8 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     elif coarse is not None:
         lines.append(f"rate_hz = {coarse[1]:.4g}   # several samples share each stamp of {quoted(clock.name)}")
     else:
-        lines.append(f"{time_line(clock)}{guessed}")
+        lines.append(f"{time_line(clock, period := logs[0].period)}{guessed}")
+        time = np.unwrap(time, period=period * TO_SI[clock.units or "s"].factor) if period else time
     if clock is None or is_nameless(clock.name):
         lines += rate_by_speeds(logs[0])
     for channel, families in rivals.items():

@@ -131,6 +131,7 @@ ERRORS = {
     "joint still": (values(f"{ID2}/q", at((slice(None), 0), 0.3)), f"/{ID2}/q", "MCP never moves"),
     "all joints still": (values(f"{VD3}/q", lambda q: 0 * q), f"/{VD3}/q", "no joint moves"),
     "excursion in mm": (values(f"{ID2}/tendon_excursion", lambda x: 1e3 * x), f"/{ID2}/tendon_excursion", "mm to m"),
+    "excursion in cm": (values(f"{ID2}/tendon_excursion", lambda x: 1e2 * x), f"/{ID2}/tendon_excursion", "cm to m"),
     "hole in excursion": (
         values(f"{ID2}/tendon_excursion", at((7, 1), np.nan)),
         f"/{ID2}/tendon_excursion",

@@ -11,6 +11,7 @@ import scipy.io
 
 from jaxfinger.cli import main
 from jaxfinger.data import read_session
+from jaxfinger.data.importing.by_mapping import import_session
 from jaxfinger.data.importing.mapping import read_mapping
 from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
@@ -18,6 +19,8 @@ from jaxfinger.data.importing.survey import clocks_of, columns_of
 from jaxfinger.data.units import TO_SI
 from tests.data.conftest import GAPPED_MS, ONE_JOINT, make_finger
 
+TIME = np.arange(400) / 100.0
+SWEEP = 0.5 + 0.4 * np.sin(TIME)
 CASES = Path(__file__).parents[1] / "cases"
 
 
@@ -437,3 +440,39 @@ def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path,
     np.testing.assert_allclose(trial.time, (GAPPED_MS - GAPPED_MS[0]) / 1e3, atol=1e-6)
     np.testing.assert_array_equal(trial.q[:, 0], angle)
     np.testing.assert_array_equal(trial.joint_torque[:, 0], torque)
+
+
+def test_arrays_with_joints_first_are_named(tmp_path):
+    scipy.io.savemat(tmp_path / "log.mat", {"t": TIME, "q": np.stack([SWEEP, SWEEP])})
+    assert '# "q" is 2 by 400, joints first: transpose it, and save it again' in proposal(
+        [load_recording(tmp_path / "log.mat")]
+    )
+
+
+def test_a_log_whose_clock_began_elsewhere_is_told_how_to_join_a_trial(tmp_path):
+    logs = [tmp_path / "angles.csv", tmp_path / "forces.csv"]
+    for path, start, name in zip(logs, (1.7e9, 0.0), ("angle [rad]", "force [N]"), strict=True):
+        table = np.column_stack([start + TIME, SWEEP])
+        np.savetxt(path, table, "%.6f", ",", header=f"stamp,{name}", comments="")
+    said = proposal([load_recording(path) for path in logs])
+    assert 'each with file = "forces.csv" and time =\n# { from = "stamp", offset = … }' in said
+    mapping = tmp_path / "m.toml"
+    mapping.write_text(
+        ONE_JOINT + '[trials.a]\nexperiment = "VD.1"\ntime = "stamp"\nfile = "angles.csv"\n'
+        'channels.q.MCP = "angle [rad]"\nchannels.tendon_force.T1 = { from = "force [N]", file = "forces.csv", '
+        'time = { from = "stamp", offset = 1.7e9 } }\n'
+    )
+    trial = import_session(logs, mapping)["a"]
+    assert trial.tendon_force is not None
+    np.testing.assert_allclose(trial.tendon_force[:, 0], SWEEP, atol=1e-5)
+
+
+@pytest.mark.parametrize(("bits", "unwraps"), [(32, True), (16, True), (31, False)])
+def test_a_clock_that_wraps_after_its_bits_is_unwrapped(tmp_path, bits, unwraps):
+    """Any other jump back begins another part."""
+    ticks = (2**bits - 2000 + np.round(1e3 * TIME)) % 2**bits
+    table = np.column_stack([ticks, SWEEP])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t_ms,q", comments="")
+    said = proposal([load_recording(tmp_path / "log.csv")])
+    assert (f'time = {{ from = "t_ms", units = "ms", unwrap = {2**bits} }}' in said) == unwraps
+    assert ("the time begins again" in said) != unwraps

@@ -174,3 +174,19 @@ def test_labview_states_units_in_its_header(tmp_path):
     assert 'time = "X_Value"' in said
     assert 'from = "angle", units = "deg" }' in said
     assert 'from = "force", units = "?" }   # it states Volts: write `scale` too' in said
+
+
+def test_labview_may_write_times_before_each_channel_or_only_their_step(tmp_path):
+    """The channels then have clocks of their own, or the times of the header."""
+    head = LVM[: LVM.index("Channels")] + "{}***End_of_Header***\t\t\t\t\nX_Value\tangle\tX_Value\tforce\tComment\n"
+    lines = "Y_Unit_Label\tDeg\t\tNewtons\t\nX_Dimension\tTime\t\tTime\t\n"
+    found = written(tmp_path, "{t:.2f}\t{a}\t{t:.2f}\t{f}\t", head.format(lines), "several.lvm")
+    assert {name: v.clock for name, v in found.variables.items() if v.clock} == {
+        "angle": "angle.time",
+        "force": "force.time",
+    }
+    np.testing.assert_allclose(found.variables["force.time"].values, TIME)
+    head = LVM.replace("X0\t", "Y_Unit_Label\tDeg\tNewtons\t\nX_Dimension\tTime\tTime\t\nX0\t")
+    found = written(tmp_path, "\t{a}\t{f}\t", head, "none.lvm")
+    np.testing.assert_allclose(found.variables["X_Value"].values, TIME, atol=1e-12)
+    assert 'time = "X_Value"\n' in proposal([found])

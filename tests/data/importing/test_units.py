@@ -128,6 +128,8 @@ def test_an_open_unit_is_refused(tmp_path):
         ("torque oz_in", "?", "it states oz in"),
         ("force_kg", "kgf", ""),
         ("force_g", "gf", ""),
+        ("force_N", "N", ""),
+        ("T1_N", "N", ""),
         ("force_mV", "?", "it states mV"),
         ("angle_counts", "?", "it states counts"),
         ("angle_in", "rad", ""),
@@ -229,3 +231,25 @@ def test_a_known_tension_at_a_held_joint_tells_the_unit_of_the_torque(tmp_path, 
     pull = 6.0 + 5.0 * np.sin(TIME)
     path = log(tmp_path, "time [s],q,tension [N],torque", 0.5 + 0.0 * TIME, pull, -torque * pull)
     assert f'units = "{units}"' in line(path, "joint_torque")
+
+
+def test_travels_in_two_units_are_not_read_in_one(tmp_path):
+    """Those a thousand times smaller than others may be in m beside mm."""
+    path = log(tmp_path, "time [s],q,excursion 1,excursion 2", SWEEP, 8.0 * SWEEP, 0.009 * SWEEP)
+    said = proposal([load_recording(path)])
+    assert 'from = "excursion 1", units = "mm" }' in said
+    assert 'from = "excursion 2", units = "?" }' in said
+
+
+def test_a_count_of_samples_is_no_force(tmp_path):
+    path = log(tmp_path, "time [s],q,sample_N", SWEEP, np.arange(400.0))
+    assert "tendon_force" not in proposal([load_recording(path)])
+
+
+def test_m_behind_a_name_may_mean_measured(tmp_path):
+    """So it tells no unit, and hides no channel."""
+    path = log(tmp_path, "time [s],q_J1_m,l_T1_m,f_T1_N", SWEEP, 3.0 * SWEEP, 2.0 + SWEEP)
+    said = proposal([load_recording(path)], replace(make_finger(), joint_names=("J1", "J2"), excursion=None))
+    assert 'channels.q.J1 = { from = "q_J1_m", units = "rad" }' in said
+    assert 'channels.tendon_excursion.T1 = { from = "l_T1_m", units = "?" }' in said
+    assert 'channels.tendon_force.T1 = { from = "f_T1_N", units = "N" }' in said
