@@ -30,6 +30,7 @@ TO_SI = {
     "um": Unit("m", 1e-6),
     "N": Unit("N", 1.0),
     "mN": Unit("N", 1e-3),
+    "cN": Unit("N", 1e-2),
     "kN": Unit("N", 1e3),
     "gf": Unit("N", 1e-3 * STANDARD_GRAVITY),
     "kgf": Unit("N", STANDARD_GRAVITY),

@@ -29,8 +29,8 @@ MAX_TARE_ERROR = 0.03
 _MAX_TARE = 0.5  # of the highest tension: a tendon that reads more is pulled.
 _MAX_PUSH = 0.1
 # Of the machine's reach. A moment arm is about a tenth of it, and a joint turns by less than a turn; degrees for rad
-# make 57 times as much, which the check of moment arms names, and mm for m a thousand times.
-_MAX_EXCURSION = 20.0
+# make 57 times as much, which the check of moment arms names, and cm for m a hundred times.
+_MAX_EXCURSION = 10.0
 # Of the torque with which the whole machine weighs on an arm as long as its reach. A motor that leads a light joint
 # with friction and stiff springs gives up to tens of it; torques in N mm of one that only weighs are some 400 of it.
 _MAX_TORQUE = 200.0

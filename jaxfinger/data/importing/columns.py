@@ -261,9 +261,12 @@ class ColumnReader:
         of = [(term, self._source(term, where).variable(term.from_, where)) for term in terms(spec)]
         if all(unit_name(v.units) == (term.units or "rad") and term.scale in (1.0, -1.0) for term, v in of):
             stated = listed(list(dict.fromkeys(variable.units for _, variable in of)))
+            degrees = np.radians((low, high))
+            fits = stated == "rad" and limits.min() - 0.35 <= degrees[0] and degrees[1] <= limits.max() + 0.35
+            wrong = 'if they are degrees, write units = "deg" all the same; ' if fits else ""
             where.fail(
-                f"runs from {low:.3g} to {high:.3g} rad, more than a turn, and the recording states {stated}; if the "
-                f"joint turns on, write {limits_of_turns(low, high)}"
+                f"runs from {low:.3g} to {high:.3g} rad, more than a turn, and the recording states {stated}; {wrong}"
+                f"if the joint turns on, write {limits_of_turns(low, high)}"
             )
 
     def _source(self, spec: Column, where: Place) -> Source:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from jaxfinger.data.importing.logs import Log
-from jaxfinger.data.importing.names import is_before_a_gear, is_position, is_speed
+from jaxfinger.data.importing.names import is_before_a_gear, is_position, is_speed, words
 from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
@@ -49,9 +50,14 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
     else:
         parts.append('units = "?"')
         doubts.append(_doubt(seen))
-    if seen.meaning == "tendon_excursion" and "length" in f"{seen.name} {seen.column or ''}".lower():
+    if seen.meaning == "tendon_excursion" and _has_length(seen):
         doubts.append("a length that falls as the tendon is pulled in needs scale = -1")
     return "{ " + ", ".join(parts) + " }" + (f"   # {'; '.join(doubts)}" if doubts else "")
+
+
+def _has_length(seen: ColumnSurvey) -> bool:
+    """Whether a column's name calls it a length, as of the tendon or its muscle."""
+    return re.search(r"length|(?<![a-z])len(?![a-z])", words(f"{seen.name} {seen.column or ''}")) is not None
 
 
 def time_line(clock: ColumnSurvey, period: int = 0) -> str:

@@ -90,7 +90,7 @@ def _table(name: str, rows: Mapping[str, np.ndarray | np.floating]) -> str:
 COLUMNS = """# Which column of which recording is what. Import with:
 #     jaxfinger import RECORDING … --mapping THIS_FILE --output session.h5
 # A column is { from = NAME, scale = 1.0, offset = 0.0, units = UNITS }: (column · scale + offset) in these units.
-# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, kN, gf, kgf; N m, N cm, N mm; s, ms, us, ns, min, h, day.
+# Units: rad, mrad, deg, turn; m, cm, mm, um; N, mN, cN, kN, gf, kgf; N m, N cm, N mm; s, ms, us, ns, min, h, day.
 # Leave out what was not measured.
 """
 

@@ -63,6 +63,6 @@ def test_limits_in_degrees_are_never_taken_for_several_turns(session):
 def test_the_angle_between_links_is_told_from_other_angles_beyond_their_limits(session, between):
     """It is half a turn where the finger is straight."""
     trial = session["01-ID.2-MCP"]
-    q = np.pi - trial.q if between else 2.5 + trial.q
+    q = np.pi - trial.q if between else -1.5 - trial.q
     (said, *_) = _said_of_angles(replace(session, trials={trial.name: replace(trial, q=q)}))
     assert ("write scale = -1.0 and offset = 180.0" in said) == between

@@ -253,3 +253,18 @@ def test_m_behind_a_name_may_mean_measured(tmp_path):
     assert 'channels.q.J1 = { from = "q_J1_m", units = "rad" }' in said
     assert 'channels.tendon_excursion.T1 = { from = "l_T1_m", units = "?" }' in said
     assert 'channels.tendon_force.T1 = { from = "f_T1_N", units = "N" }' in said
+
+
+def test_a_header_that_says_rad_of_degrees_is_told_apart_from_a_joint_that_turns_on(tmp_path):
+    path = log(tmp_path, "t,q [rad],F [cN]", np.degrees(SWEEP), 200.0 + SWEEP)
+    (tmp_path / "m.toml").write_text(
+        ONE_JOINT
+        + '[trials.a]\nexperiment = "VD.1"\ntime = "t"\nchannels.q.MCP = { from = "q [rad]", units = "rad" }\n'
+        'channels.tendon_force.T1 = { from = "F [cN]", units = "cN" }\n'
+    )
+    with pytest.raises(UserError, match='if they are degrees, write units = "deg" all the same'):
+        import_session([path], tmp_path / "m.toml")
+    (tmp_path / "m.toml").write_text((tmp_path / "m.toml").read_text().replace('units = "rad"', 'units = "deg"'))
+    trial = import_session([path], tmp_path / "m.toml")["a"]
+    assert trial.tendon_force is not None
+    np.testing.assert_allclose(trial.tendon_force[:, 0], 2.0 + 0.01 * SWEEP, atol=1e-8)
