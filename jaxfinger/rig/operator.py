@@ -16,6 +16,7 @@ from jaxfinger.errors import UserError
 # s that a prompt must have been on the screen, without an Enter, before Enter answers it: two presses in a row are one,
 # and a key that is held down, which repeats every 30 ms, answers nothing.
 READ_S = 0.5
+SUSPENDED_S = 1.0  # s between two looks at a prompt, each of 0.05 s, from which on the program was suspended meanwhile
 
 
 @runtime_checkable
@@ -48,13 +49,15 @@ class AtTerminal:
 
     The thread that asks for keys reads them itself and prints nothing, so keys also arrive from a terminal that takes
     no output. A terminal that is gone counts as a stop, since its stop key is gone with it. `say` prints a prompt, or
-    returns an event that is set once the prompt is printed.
+    returns an event that is set once the prompt is printed. After the program was suspended, as by Ctrl-Z, the prompt
+    is printed again: it may have left the screen, and an Enter may have been meant for the shell.
     """
 
     def __init__(self, say: Callable[[str], threading.Event | None] = print):
         self._say = say
         self._stop = threading.Event()
         self._enter = threading.Event()
+        self._resumed = threading.Event()  # after the shell had the terminal
         self._reading = threading.Lock()
         self._settings: list = []
         self._keys: int | None = None  # file descriptor
@@ -83,7 +86,8 @@ class AtTerminal:
         if self._keys is None or not self._reading.acquire(blocking=wait):
             return
         try:
-            _take_keys_at_once(self._keys)
+            if _take_keys_at_once(self._keys):
+                self._resumed.set()  # Before any key is read.
             while select.select([self._keys], [], [], 0)[0]:
                 pressed = os.read(self._keys, 64)
                 if not pressed:  # The terminal is gone.
@@ -106,15 +110,23 @@ class AtTerminal:
     def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
         """Show the prompt and wait for Enter. A stop key or a false `keep_waiting()` ends the wait too.
 
-        An Enter from before the prompt answers nothing: who pressed it has not read the prompt.
+        An Enter from before the prompt answers nothing: who pressed it has not read the prompt. Nor does one from
+        before it is printed again.
         """
+        prompt = f"{text}\n  Enter when done; q, space or Escape stops the rig."
         self._poll(wait=True)
+        self._resumed.clear()
         self._enter.clear()
-        printed, shown = self._say(f"{text}\n  Enter when done; q, space or Escape stops the rig."), None
+        printed, shown, looked = self._say(prompt), None, time.monotonic()
         while not self.stop_requested() and keep_waiting():
+            passed, looked = time.monotonic() - looked, time.monotonic()
+            if self._resumed.is_set() or passed > SUSPENDED_S:
+                self._resumed.clear()
+                self._enter.clear()
+                printed, shown = self._say(prompt), None
             if shown is None and (printed is None or printed.is_set()):
-                shown = time.monotonic()
-            if self._enter.wait(0.05):
+                shown = looked
+            if self._enter.wait(0.05) and not self._resumed.is_set():
                 if shown is not None and time.monotonic() - shown >= READ_S:
                     return
                 self._enter.clear()  # Nobody can have read the prompt yet, or the key is held down.
@@ -126,10 +138,15 @@ class AtTerminal:
         return self._stop.is_set()
 
 
-def _take_keys_at_once(keys: int) -> None:
-    """Have keys arrive without Enter; after Ctrl-Z and fg the terminal is in the shell's mode, where they do not."""
+def _take_keys_at_once(keys: int) -> bool:
+    """Have keys arrive without Enter; after Ctrl-Z and fg the terminal is in the shell's mode, where they do not.
+
+    Return whether it was in that mode.
+    """
     import termios
     import tty
 
-    if os.isatty(keys) and termios.tcgetattr(keys)[3] & termios.ICANON:
-        tty.setcbreak(keys, termios.TCSANOW)  # Other ways wait until the terminal has taken all output: maybe never.
+    if not os.isatty(keys) or not termios.tcgetattr(keys)[3] & termios.ICANON:
+        return False
+    tty.setcbreak(keys, termios.TCSANOW)  # Other ways wait until the terminal has taken all output: maybe never.
+    return True

@@ -21,7 +21,7 @@ from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.course import View
 from jaxfinger.rig.live import LiveView
-from jaxfinger.rig.operator import AtTerminal, Nobody
+from jaxfinger.rig.operator import READ_S, SUSPENDED_S, AtTerminal, Nobody
 from jaxfinger.rig.simulated.examples import plan_toml, rig_toml
 from tests.rig.conftest import SHORT
 
@@ -179,6 +179,32 @@ def test_the_stop_key_works_after_the_program_was_suspended():
     assert not person.stop_requested()
     os.write(ours, b"q")
     assert person.stop_requested()
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.parametrize("shell", [True, False], ids=["Ctrl-Z and fg", "SIGSTOP and SIGCONT"])
+def test_an_enter_from_while_the_program_was_suspended_answers_no_prompt(shell):
+    """It was meant for the shell, and the prompt may have left the screen: it is printed again, and asks again."""
+    ours, theirs = pty.openpty()
+    said, begun, suspended = [], time.monotonic(), threading.Event()
+    person = AtTerminal(said.append)
+    person._keys = theirs
+
+    def look() -> bool:
+        if time.monotonic() - begun > READ_S + 0.2 and not suspended.is_set():
+            suspended.set()
+            if shell:
+                lines = termios.tcgetattr(theirs)
+                lines[3] |= termios.ICANON
+                termios.tcsetattr(theirs, termios.TCSANOW, lines)
+            else:
+                time.sleep(SUSPENDED_S + 0.1)
+            os.write(ours, b"\n\n")
+        return len(said) < 2
+
+    person.ask("Hands off: the drives are about to be switched on.", look)
+    assert said == said[:1] * 2
     os.close(ours)
     os.close(theirs)
 
