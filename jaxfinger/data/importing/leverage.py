@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from jaxfinger.data.importing.names import Owners
 from jaxfinger.data.importing.recording import Recording
-from jaxfinger.data.importing.survey import ColumnSurvey, columns_of, values_of, weight_on_reach
+from jaxfinger.data.importing.survey import ColumnSurvey, agreed, columns_of, values_of, weight_on_reach
 from jaxfinger.data.importing.turning import by_speeds
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.units import STANDARD_GRAVITY, TO_SI, spelt
@@ -22,12 +23,20 @@ from jaxfinger.data.units import STANDARD_GRAVITY, TO_SI, spelt
 # as shares of the largest: routed tendons lose up to two thirds of their tension on the way to the joint.
 _ARMS = 1.5e-3, 60e-3
 _OF_KNOWN = {"tendon_excursion": (0.5, 1.5), "tendon_force": (0.25, 1.5), "joint_torque": (0.25, 1.5)}
-# Units of logs for each channel, with their SI factors. Those that no mapping knows keep another from being taken.
+# Units of logs for each channel, with their SI factors, and those that are taken. The others only keep these from being
+# taken, since turns of a spool and volts of a load cell may be of the same size.
 _UNITS = {
     "tendon_excursion": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
-    "tendon_force": {"N": 1.0, "mN": 1e-3, "gf": 1e-3 * STANDARD_GRAVITY, "kgf": STANDARD_GRAVITY},
+    "tendon_force": {
+        "N": 1.0,
+        "lbf": 0.45359237 * STANDARD_GRAVITY,
+        "mN": 1e-3,
+        "gf": 1e-3 * STANDARD_GRAVITY,
+        "kgf": STANDARD_GRAVITY,
+    },
     "joint_torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3, "kgf cm": 1e-2 * STANDARD_GRAVITY},
 }
+_TAKEN = "m", "mm", "N", "N m", "N mm"
 _MIN_TURN, _MAX_YIELD = 0.2, 0.05  # rad: a joint that turns, and one that is held
 _MIN_SHARE = 0.2  # of the largest change among tensions: smaller ones do not tell an arm
 _MIN_EXPLAINED = 0.9  # of a column's variance: with less, something else than a lever moves it
@@ -41,7 +50,21 @@ def surveyed(recordings: Sequence[Recording], finger: FingerDescription | None) 
     names = (finger.joint_names, finger.tendon_names) if finger is not None else ()
     weight = weight_on_reach(finger)
     seen = [by_speeds(r, columns_of(r, recordings, *names, weight=weight)) for r in recordings]
-    return by_arms(recordings, seen, finger)
+    return by_arms(recordings, _agreed(recordings, seen, Owners(*names or ((), ())), weight), finger)
+
+
+def _agreed(
+    recordings: Sequence[Recording], seen: Sequence[Sequence[ColumnSurvey]], owners: Owners, weight: float
+) -> list[list[ColumnSurvey]]:
+    """Surveys with one guess for the columns of one quantity in all recordings, as torques of one joint in each."""
+    rows = [(r, s) for r, columns in zip(recordings, seen, strict=True) for s in columns]
+    sizes = {
+        i: float(np.nanmax(np.abs(values_of(r, s))))
+        for i, (r, s) in enumerate(rows)
+        if s.meaning in _UNITS and _is_open(s, s.meaning)
+    }
+    told = iter(agreed([s for _, s in rows], sizes, owners, weight))
+    return [[next(told) for _ in columns] for columns in seen]
 
 
 def by_arms(
@@ -61,7 +84,7 @@ def by_arms(
             continue
         power = -1.0 if channel == "tendon_force" else 1.0
         fitting = [unit for unit, factor in units.items() if low < max(slopes) * factor**power < high]
-        unit = fitting[0] if len(fitting) == 1 and fitting[0] in TO_SI else ""
+        unit = fitting[0] if len(fitting) == 1 and fitting[0] in _TAKEN else ""
         open_ = [s for columns in surveys for s in columns if _is_open(s, channel)]
         least = max(s.high - s.low for s in open_) / _MAX_RATIO if channel == "tendon_excursion" else 0.0
         told = {s: replace(s, units=unit if s.high - s.low >= least else "") for s in open_}
@@ -73,7 +96,7 @@ def _arms(finger: FingerDescription | None, channel: str) -> tuple[float, float]
     """Range in which the largest moment arm lies that a channel shows, m."""
     if finger is None or finger.excursion is None or np.isnan(finger.excursion).all():
         return _ARMS
-    q = np.linspace(*finger.limits.T, 9)[:, :, None]
+    q = np.linspace(finger.limits[:, 0], finger.limits[:, 1], 9)[:, :, None]
     power = np.arange(finger.excursion.shape[2])
     arms = np.einsum("kip,sip->ski", np.nan_to_num(finger.excursion) * (power + 1.0), q**power)
     largest = float(np.abs(arms).max())

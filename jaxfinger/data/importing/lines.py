@@ -21,6 +21,7 @@ _MAX_SPEEDS = 4  # that are named
 # SI units of a sliding joint's position and force, and their largest plausible values, with room for gantries.
 _MAX_SLIDING = {"q": ("m", 2.0), "joint_torque": ("N", 500.0)}
 _MAX_OVERTRAVEL = 0.35  # rad beyond a joint's limits, since stated limits are approximate
+_MOST_OF_A_TURN = 6.0  # rad
 _USUAL_RATES = 100, 1000  # Hz
 
 
@@ -111,6 +112,17 @@ def turns_line(columns: Sequence[ColumnSurvey], limits: np.ndarray) -> list[str]
         return []
     said = [f"{np.degrees(low * f):.0f} to {np.degrees(high * f):.0f} degrees" for f in (1.0, turn)]
     return [f"# q runs from {said[0]} if in rad, and from {said[1]} if in turns, as some motor drives count"]
+
+
+def within(seen: ColumnSurvey, limits: np.ndarray | None) -> ColumnSurvey:
+    """Survey of a column whose angles are no longer taken for rad where they go farther than the joint's `limits`, rad.
+
+    They may be turns of a motor before its gear. An encoder that wraps goes through a whole turn.
+    """
+    if seen.meaning != "q" or seen.units != "rad" or limits is None or not _is_guessed(seen):
+        return seen
+    farther = float(np.ptp(limits)) + 2.0 * _MAX_OVERTRAVEL < seen.high - seen.low < _MOST_OF_A_TURN
+    return replace(seen, units="") if farther else seen
 
 
 def _is_guessed(seen: ColumnSurvey) -> bool:

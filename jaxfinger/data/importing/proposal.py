@@ -22,6 +22,7 @@ from jaxfinger.data.importing.lines import (
     torque_line,
     transposed_lines,
     turns_line,
+    within,
 )
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import MOTOR, is_nameless, is_set_point, words
@@ -153,10 +154,11 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     elif coarse is None and (np.diff(time) <= 0.0).any():
         lines.append("sort = true   # its stamps are out of order, or repeated")
     slides = dict(zip(finger.joint_names, finger.prismatic, strict=True)) if finger is not None else {}
+    limits_of = dict(zip(finger.joint_names, finger.limits, strict=True)) if finger is not None else {}
     turns = finger is not None and any(map(beyond_a_turn, finger.limits))
     rows = {
         channel: [
-            (name, column_line(s, elsewhere.get(s), slides.get(name, False), turns))
+            (name, column_line(within(s, limits_of.get(name)), elsewhere.get(s), slides.get(name, False), turns))
             for name, s in zip(names[channel], columns, strict=True)
         ]
         for channel, columns in channels.items()

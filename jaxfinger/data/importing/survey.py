@@ -34,12 +34,12 @@ _MIN_EVEN = 0.9
 # is the guess; sizes that are usual in several units leave it open. Torques from 0.2 to 500 may be an arm's in N m or a
 # finger's in N mm, and a link of 1 g weighs 0.2 N mm at 2 cm. The finger's own weight tells more of torques. Tensions
 # up to 15 may be in kgf, or volts of a load cell, and those above 100 in gf; so may smaller forces at the fingertip.
-# Travel from 0.1 to 8 may be in cm. Moment arms tell more of all these (`leverage`).
+# Travel from 0.01 to 8 may be in cm or of a spool. Moment arms tell more of all these (`leverage`).
 _MAX_VALUES = {
     "q": (("rad", 7.0), ("deg", 400.0)),
     "joint_torque": (("N m", 0.2), ("", 500.0), ("N mm", 5e3)),
     "tendon_force": (("", 15.0), ("N", 100.0), ("", 1e6)),
-    "tendon_excursion": (("m", 0.1), ("", 8.0), ("mm", 200.0)),
+    "tendon_excursion": (("m", 0.01), ("", 8.0), ("mm", 200.0)),
     "fingertip_force": (("", 0.5), ("N", 20.0), ("", 1e5)),
     "temperature": (("degC", 200.0), ("K", 1e3)),
 }
@@ -48,8 +48,8 @@ _MAX_VALUES = {
 _MAX_TURNS = 0.3
 # Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
 # since in N cm or N mm they would be a few hundredths of it, less than any load moves them. Larger ones than the second
-# are in N mm: `check` refuses them in N m. Between them the unit stays open.
-_WEIGHTS = 3.0, 200.0
+# are in N mm: in N cm they would be twenty times it. Between them the unit stays open.
+_WEIGHTS = 3.0, 2000.0
 _MIN_DATE = 1e4  # days: spreadsheets count them from 1900, and MATLAB from the year 0.
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
 _INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
@@ -135,7 +135,7 @@ def columns_of(
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign, whole))
-    found = _without_turns(_agreed(found, guessed, owners, weight), guessed)
+    found = _without_turns(agreed(found, guessed, owners, weight), guessed)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
             x = np.ravel(recording.variables[s.name].values)
@@ -205,7 +205,7 @@ def _rises_evenly(x: np.ndarray) -> bool:
     return bool(np.mean((ratio > 0.5) & (ratio < 2.0)) > _MIN_EVEN)
 
 
-def _agreed(
+def agreed(
     found: Sequence[ColumnSurvey], guessed: Mapping[int, float], owners: Owners, weight: float
 ) -> list[ColumnSurvey]:
     """Columns of one quantity, with one guess of their unit: that of the largest value.
@@ -213,13 +213,13 @@ def _agreed(
     Where too few of them need that unit they may have several, as joints that slide or turn on, and all are left open.
     `guessed` has the sizes of the columns whose unit is guessed, by their places.
     """
-    agreed = list(found)
+    alike = list(found)
     for group, least in _of_one_quantity(found, list(guessed), owners):
         largest = _unit(found[group[0]].meaning, [guessed[i] for i in group], weight)
         many = sum(found[i].units == largest for i in group) >= least
         for i in group:
-            agreed[i] = replace(found[i], units=largest if many else "")
-    return agreed
+            alike[i] = replace(found[i], units=largest if many else "")
+    return alike
 
 
 def _without_turns(found: Sequence[ColumnSurvey], guessed: Mapping[int, float]) -> list[ColumnSurvey]:

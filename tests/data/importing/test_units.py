@@ -202,11 +202,14 @@ def test_the_travel_of_a_tendon_is_in_the_unit_that_makes_moment_arms(tmp_path, 
     assert f'units = "{units}"' in line(path, "tendon_excursion")
 
 
-def test_known_moment_arms_tell_centimetres(tmp_path):
+@pytest.mark.parametrize(("arm", "units"), [(4.0, "mm"), (0.4, "?")])
+def test_known_moment_arms_tell_small_travels_in_mm(tmp_path, arm, units):
+    """What would be cm may also be turns of a spool."""
     finger = replace(make_finger(), joint_names=("J1", "J2"), tendon_names=("T1", "T2", "T3"))
-    path = log(tmp_path, "time [s],q1,q2,excursion 1", SWEEP, 0.0 * SWEEP, 0.8 * SWEEP)
+    finger = replace(finger, excursion=0.5 * make_finger().excursion)
+    path = log(tmp_path, "time [s],q1,q2,excursion 1", SWEEP, 0.0 * SWEEP, arm * SWEEP)
     said = proposal([load_recording(path)], finger)
-    assert 'channels.tendon_excursion.T1 = { from = "excursion 1", units = "cm" }' in said
+    assert f'channels.tendon_excursion.T1 = {{ from = "excursion 1", units = "{units}" }}' in said
 
 
 @pytest.mark.parametrize(("size", "units"), [(1.0, "?"), (14.0, "?"), (40.0, "N"), (400.0, "?"), (5000.0, "?")])
@@ -217,7 +220,7 @@ def test_a_tension_of_any_size_that_people_use_in_two_units_is_asked_for(tmp_pat
 
 @pytest.mark.parametrize(
     ("torque", "tension", "units"),
-    [(8.0, 1.0, "N"), (78.0, 1.0, "kgf"), (36.0, 1.0, "?"), (0.078, 100.0, "gf"), (8000.0, 0.01, "?")],
+    [(6.0, 1.0, "N"), (60.0, 0.1, "?"), (30.0, 1.0, "?"), (0.06, 100.0, "?"), (6000.0, 0.01, "?")],
 )
 def test_a_known_torque_at_a_held_joint_tells_the_unit_of_the_tension(tmp_path, torque, tension, units):
     pull = 6.0 + 5.0 * np.sin(TIME)
@@ -226,7 +229,7 @@ def test_a_known_torque_at_a_held_joint_tells_the_unit_of_the_tension(tmp_path, 
     assert f'units = "{units}"' in line(path, "tendon_force")
 
 
-@pytest.mark.parametrize(("torque", "units"), [(8.0, "N mm"), (0.8, "N cm"), (0.008, "N m"), (0.08, "?")])
+@pytest.mark.parametrize(("torque", "units"), [(8.0, "N mm"), (0.8, "?"), (0.008, "N m"), (0.08, "?")])
 def test_a_known_tension_at_a_held_joint_tells_the_unit_of_the_torque(tmp_path, torque, units):
     pull = 6.0 + 5.0 * np.sin(TIME)
     path = log(tmp_path, "time [s],q,tension [N],torque", 0.5 + 0.0 * TIME, pull, -torque * pull)
@@ -268,3 +271,22 @@ def test_a_header_that_says_rad_of_degrees_is_told_apart_from_a_joint_that_turns
     trial = import_session([path], tmp_path / "m.toml")["a"]
     assert trial.tendon_force is not None
     np.testing.assert_allclose(trial.tendon_force[:, 0], 2.0 + 0.01 * SWEEP, atol=1e-8)
+
+
+def test_torques_of_one_joint_a_recording_have_one_unit(tmp_path):
+    """Those of the last joint are small in kgf cm too."""
+    logs = []
+    for joint, size in (("MCP", 0.5), ("DIP", 0.05)):
+        (folder := tmp_path / joint).mkdir()
+        logs.append(log(folder, f"time [s],q_MCP [rad],q_DIP [rad],tau_{joint}", SWEEP, SWEEP, size * np.cos(TIME)))
+    said = [s for s in proposal([load_recording(path) for path in logs]).splitlines() if "channels.joint_torque" in s]
+    assert len(said) == 2
+    assert all('units = "?"' in s for s in said)
+
+
+@pytest.mark.parametrize(("size", "units"), [(1.0, "rad"), (4.5, "?")])
+def test_an_angle_that_goes_farther_than_its_limits_is_asked_for(tmp_path, size, units):
+    """It may be of a motor before its gear."""
+    finger = replace(make_finger(), joint_names=("J1", "J2"))
+    path = log(tmp_path, "time [s],q_J1", size * SWEEP)
+    assert f'channels.q.J1 = {{ from = "q_J1", units = "{units}" }}' in proposal([load_recording(path)], finger)
