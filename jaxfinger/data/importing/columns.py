@@ -37,6 +37,8 @@ _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
 # Coarse stamps repeat regularly: as many samples to each, within one or a fifth, with room for jitter. Fewer repeated
 # stamps may be samples that were logged twice, and fewer stamps show no regularity.
 _MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR, _MAX_UNEVEN = 0.1, 10, 0.9, 0.2
+_MIN_DEGREES = 20.0  # Over fewer no joint is moved: that many rad are then those of one that turns on.
+_MAX_OVERTRAVEL = 0.35  # rad beyond a joint's limits, since stated limits are approximate
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
 
@@ -262,7 +264,8 @@ class ColumnReader:
         if all(unit_name(v.units) == (term.units or "rad") and term.scale in (1.0, -1.0) for term, v in of):
             stated = listed(list(dict.fromkeys(variable.units for _, variable in of)))
             degrees = np.radians((low, high))
-            fits = stated == "rad" and limits.min() - 0.35 <= degrees[0] and degrees[1] <= limits.max() + 0.35
+            fits = stated == "rad" and high - low > _MIN_DEGREES and limits.min() - _MAX_OVERTRAVEL <= degrees[0]
+            fits = fits and degrees[1] <= limits.max() + _MAX_OVERTRAVEL
             wrong = 'if they are degrees, write units = "deg" all the same; ' if fits else ""
             where.fail(
                 f"runs from {low:.3g} to {high:.3g} rad, more than a turn, and the recording states {stated}; {wrong}"
