@@ -17,6 +17,7 @@ from jaxfinger.sealed.truth import NONE, UNLISTED, Diagnosis, Truth, read_diagno
 
 STRETCH, CREEP = ("tendon_stretch", ("T3",)), ("tendon_creep", ("T3",))
 STRETCH_T1 = ("tendon_stretch", ("T1",))
+ROTATION = ("force_sensor_rotation", ("fingertip",))
 
 
 def said(status, named=(), sets=(), values=None, **probability):
@@ -223,6 +224,15 @@ def test_what_is_missing_is_said_in_one_sentence(tmp_path):
     (tmp_path / "gap.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read as JSON"):
         read_diagnosis(tmp_path)
+
+
+@pytest.mark.parametrize(("reached", "kind", "at_work"), [(1e-9, "none", NONE), (0.5, "listed", ROTATION)])
+def test_an_effect_that_leaves_no_trace_is_not_at_work(tmp_path, reached, kind, at_work):
+    rotation = {"effect": ROTATION[0], "site": ROTATION[1], "listed": True, "severity": 10.0, "reached": reached}
+    (tmp_path / "truth.json").write_text(json.dumps({"kind": "listed", "effects": [rotation]}))
+    truth = read_truth(tmp_path, None)
+    assert truth.kind == kind
+    assert truth.at_work == {at_work}
 
 
 def test_a_case_with_hardly_anything_to_close_moves_the_mean_and_not_the_median():
