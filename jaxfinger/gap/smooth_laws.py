@@ -2,7 +2,8 @@
 
 Features of a column are polynomials of angles and tensions, functions of speed, direction, time, and of the distance
 since the last reversal; speeds and directions also times angles. They bound what any listed or unlisted law could
-explain; they never name a cause.
+explain; they never name a cause. The direction in which a tendon moves is none: where it rests, its measured excursion
+tells it, whose noise is in the residual too.
 """
 
 from collections.abc import Iterator
@@ -50,8 +51,7 @@ def features(
     x, scales = stack.batch.x, problem.scales
     finger = problem.nominal.finger
     q, qd, f = np.asarray(x.q), np.asarray(x.qd), np.asarray(x.tension)
-    direction, tendon_direction = np.asarray(x.joint_direction), np.asarray(x.tendon_direction)
-    time = np.asarray(x.time)
+    direction, time = np.asarray(x.joint_direction), np.asarray(x.time)
     own, taut = concerned(finger, channel, column)
     out: dict[str, list[np.ndarray]] = {
         "q": [],
@@ -81,8 +81,6 @@ def features(
             out["tension"] += [u, u**2, np.sqrt(np.maximum(u, 0))] + [u * _unit(q[i]) for i in own]
             pulled = since_reversal(_smoothed(f[k])) / (PULL * scales.tension[k])
             out["distance since reversal"] += [np.exp(-np.abs(pulled)) * np.tanh(10.0 * pulled)]
-            if channel == "tendon_excursion":  # In torques, the nominal friction of tendons leaves nothing of it.
-                out["direction"] += [tendon_direction[k]]
     for i in range(finger.m):
         if i not in own:
             out["other joints"] += [_unit(q[i]), _unit(q[i]) ** 2] + [_unit(q[i]) * _unit(q[j]) for j in own]
