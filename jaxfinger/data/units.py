@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection
 from typing import NamedTuple
 
+MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
 STANDARD_GRAVITY = 9.80665  # m s⁻², ISO 80000-4; `scipy.constants` has it too, but its import takes 0.4 s.
 
 
@@ -53,17 +54,9 @@ TO_SI = {
 }
 _SPELT = {"°": "deg", "度": "deg", "degrees": "deg", "µm": "um", "µs": "us", "rev": "turn", "sec": "s"}
 _SPELT |= {"°c": "degC", "degc": "degC", "celsius": "degC"}
-_SPELT |= {
-    "deg": "deg",
-    "rad": "rad",
-    "degree": "deg",
-    "radian": "rad",
-    "radians": "rad",
-    "turns": "turn",
-    "revs": "turn",
-    "revolutions": "turn",
-}
-_SPELT |= {"revolution": "turn", "cycle": "turn", "cycles": "turn", "umdrehung": "turn", "umdrehungen": "turn"}
+_SPELT |= {"deg": "deg", "rad": "rad", "degree": "deg", "radian": "rad", "radians": "rad"}
+_SPELT |= {"turns": "turn", "revs": "turn", "revolution": "turn", "revolutions": "turn"}
+_SPELT |= {"cycle": "turn", "cycles": "turn", "umdrehung": "turn", "umdrehungen": "turn"}
 _SPELT |= {"gons": "gon", "gradian": "gon", "gradians": "gon"}
 _SPELT |= {"second": "s", "seconds": "s", "days": "day", "newton": "N", "newtons": "N"}
 _SPELT |= {"meters": "m", "metres": "m", "meter": "m", "millimeters": "mm", "millimetres": "mm", "newton meters": "N m"}
@@ -164,6 +157,11 @@ def unit_name(stated: str) -> str:
 def whole_turns(x: float, period: float, limits: Collection[float]) -> float:
     """Sum of whole periods that brings `x` nearest to the middle of the limits."""
     return round((sum(limits) / len(limits) - x) / period) * period
+
+
+def near_limits(low: float, high: float, limits: Collection[float]) -> bool:
+    """Whether an angle that runs from `low` to `high` rad stays near the joint's limits."""
+    return bool(min(limits) - MAX_OVERTRAVEL <= low and high <= max(limits) + MAX_OVERTRAVEL)
 
 
 def limits_of_turns(low: float, high: float) -> str:

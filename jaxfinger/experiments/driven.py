@@ -41,8 +41,8 @@ MAX_LOST_SPEED_SHARE = 0.5  # of a joint's speed that the slow filter may lose; 
 MIN_SLIP_TO_NOISE = 15.0  # ten standard deviations: a smaller loss is not a slip
 ROUNDING_SHARE = 1e-6  # of the motion's speed: a loss by rounding, of a joint at rest in a simulated file
 CLEAR_WIDTHS = 2.3  # widths of the filter left out on either side of unknown friction: 1 % of a jump remains beyond
-# Widths left out after a joint that no motor moves seems to have broken away. It may do so suddenly, and the filter
-# shows a speed's step of one as Φ(t) at t widths after it, that is MIN_SPEED_SHARE of it so much before.
+# Widths left out after a joint that no motor moves seems to break away. It may do so suddenly, and at t widths after a
+# step of speed the filter shows the share Φ(t) of it: MIN_SPEED_SHARE of it shows so many widths before the step.
 BREAKAWAY_WIDTHS = -float(ndtri(MIN_SPEED_SHARE))
 # Travel over which friction reverses, in median residuals of the encoder: 1.5 of its standard deviations. A longer
 # travel suits compliant contacts, a shorter one stiff contacts (benchmarks/reversals.py).
@@ -213,7 +213,7 @@ def clear_of_unknown(r: PreparedTrial, slides: Bool[np.ndarray, "N m"], clear: f
     """Samples that slide, as do all that the filter reads. `clear`: s, left out on either side of those that do not."""
     # The filter spreads the jump of friction at a reversal, and reads samples of unknown friction before a slide.
     apart = _apart(slides, clear, r.step)
-    # The window reaches back only.
+    # The window reaches back only: a start may be sudden, which the filter shows too early, and a stop is gradual.
     half = round(0.5 * BREAKAWAY_WIDTHS * filter_std(r.experiment.cutoff) / r.step)
     return np.where(r.motorised, apart, minimum_filter1d(apart, 2 * half + 1, axis=0, origin=half))
 

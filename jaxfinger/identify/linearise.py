@@ -45,16 +45,16 @@ PANEL = 32  # columns of a panel of ?geqrt: LAPACK's own choice for ?geqrf
 class Tangent:
     """Residuals of one experiment at a model and their derivatives by p free parameters, in each channel's unit."""
 
-    there: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, where the experiment was linearised
+    before: dict[str, Float[np.ndarray, "_columns B T"]]  # measured − predicted, where the experiment was linearised
     slopes: dict[str, Float[np.ndarray, "p _columns B T"]]
-    by: Float[np.ndarray, " p"] | None = None  # step of the parameters since
+    by: Float[np.ndarray, " p"] | None = None  # step of the parameters after that
 
     @cached_property
     def residuals(self) -> dict[str, Float[np.ndarray, "_columns B T"]]:
         """Measured − predicted after the step, which costs a sum over all slopes."""
         if self.by is None:
-            return self.there
-        return {c: r + np.tensordot(self.by, self.slopes[c], 1) for c, r in self.there.items()}
+            return self.before
+        return {c: r + np.tensordot(self.by, self.slopes[c], 1) for c, r in self.before.items()}
 
     def moved(self, by: Float[np.ndarray, " p"]) -> "Tangent":
         """Tangent after a step `by` of the parameters, exact where the residuals are affine in those that move."""

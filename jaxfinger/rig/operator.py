@@ -16,7 +16,9 @@ from jaxfinger.errors import UserError
 # s that a prompt must have been on the screen, without an Enter, before Enter answers it: two presses in a row are one,
 # and a key that is held down, which repeats every 30 ms, answers nothing.
 READ_S = 0.5
-SUSPENDED_S = 1.0  # s between two looks at a prompt, each of 0.05 s, from which on the program was suspended meanwhile
+# s between two looks at a prompt, from which on the program was suspended meanwhile. A look takes 0.05 s, and tenths of
+# a second on a busy machine; Ctrl-Z and the fg after it, typed by hand, are farther apart.
+SUSPENDED_S = 1.0
 
 
 @runtime_checkable

@@ -16,8 +16,9 @@ UNLISTED: Cause = ("unlisted", ())
 MIN_DISTANCE = 3.0
 # Share of some channel's gap: a cause that closes more ought to be named. Less is hardly seen on a diagnosis's page.
 MIN_CLOSED_SHARE = 0.1
-# Severity, in units of the noise of a hold's mean. An effect that reaches less at every physical size, such as an error
-# of a fingertip's sensor in a session that has no contact, leaves no trace to diagnose: it counts as not at work.
+# Severity, in units of the noise of a hold's mean: the mean of a hundred holds has as much noise. An effect that
+# reaches less at every physical size, such as an error of a fingertip's sensor in a session that has no contact, leaves
+# no trace to diagnose: it counts as not at work.
 MIN_REACHED = 0.1
 
 
@@ -79,10 +80,9 @@ def read_truth(folder: Path, truth_root: Path | None) -> Truth:
             f"{folder}: no truth for this case in {' or '.join(str(f) for f in files)}; say where it is with --truth"
         )
     data = _load(file)
-    effects = sorted(data["effects"], key=lambda e: -float(e.get("reached", 0.0)))
-    seen = [e for e in effects if e.get("reached", MIN_REACHED) >= MIN_REACHED]
-    stated = data.get("kind") if len(seen) == len(effects) else None
-    effects = seen
+    effects = [e for e in data["effects"] if e.get("reached", MIN_REACHED) >= MIN_REACHED]
+    effects.sort(key=lambda e: -float(e.get("reached", 0.0)))
+    stated = data.get("kind") if len(effects) == len(data["effects"]) else None
     listed = [e for e in effects if e["listed"]]
     kinds = {0: "none", 1: "listed" if listed else "unlisted", 2: "double"}
     causes = {_cause(e): e for e in [*listed, *(e for e in effects if not e["listed"])]}

@@ -16,13 +16,12 @@ from jaxfinger.data.signals.motion import MIN_MOTION
 from jaxfinger.data.signals.quantiles import median, quantile
 from jaxfinger.data.signals.sizes import NOISE_FACTOR, Sizes
 from jaxfinger.data.signals.unmeasured import constant_columns, placeholder
-from jaxfinger.data.units import TO_SI, conversion, limits_of_turns, whole_turns
+from jaxfinger.data.units import MAX_OVERTRAVEL, TO_SI, conversion, limits_of_turns, near_limits, whole_turns
 from jaxfinger.errors import counted, listed
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_MAX_OVERTRAVEL = 0.35  # rad, 20 degrees, that a joint may read beyond its limits, since stated limits are approximate
 # Readings below zero, as shares of the highest tension. A good tare is off by a hundredth. A taut tendon is held at a
 # fifth or more (`data.signals.sizes`), so a column of the wrong sign reads at least twice _MAX_PUSH below zero.
 MAX_TARE_ERROR = 0.03
@@ -112,28 +111,29 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
     """Check that revolute joints stay near their limits, and are in rad if these leave them no more than a turn."""
     place = trial.place("q")
     columns = zip(finger.joint_names, trial.q.T, finger.limits, finger.prismatic, strict=True)
-    for name, q, (lower, upper), slides in columns:
+    for name, q, limits, slides in columns:
         if slides or not np.isfinite(q).all():
             continue
         measured = q[q != placeholder(q)]
         low, high = quantile(measured, 0.01), quantile(measured, 0.99)
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
-        outside = low < lower - _MAX_OVERTRAVEL or high > upper + _MAX_OVERTRAVEL
-        turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, (lower, upper))
-        fits = low + turn >= lower - _MAX_OVERTRAVEL and high + turn <= upper + _MAX_OVERTRAVEL
+        its_limits = f"its limits {limits[0]:.3g} to {limits[1]:.3g}"
+        outside = not near_limits(low, high, limits)
+        turn = whole_turns(0.5 * (low + high), 2.0 * np.pi, limits)
+        fits = near_limits(low + turn, high + turn, limits)
         unwrap = "take a whole turn off (`unwrap = true` in a mapping)"
         # Degrees of a joint that moves would exceed its limits by more than a turn.
         if outside and fits and abs(turn) < 4.0 * np.pi and high - low > MIN_MOTION:
             say = report.error if max(-low, high) > 2.0 * np.pi else report.warning
-            say(place, f"{where}, a turn beside its limits {lower:.3g} to {upper:.3g}; {unwrap}")
+            say(place, f"{where}, a turn beside {its_limits}; {unwrap}")
         elif outside and max(-low, high) > 2.0 * np.pi:
-            mend = _mend_of_turns(q, low, high, np.array((lower, upper)))
+            mend = _mend_of_turns(q, low, high, limits)
             mend += f", or {unwrap}" if fits and abs(turn) < 4.0 * np.pi else ""
             report.error(place, f"{where}, more than a turn; {mend}")
         elif outside:
-            message = f"{where}, far outside its limits {lower:.3g} to {upper:.3g}; "
+            message = f"{where}, far outside {its_limits}; "
             # The angle between two links is half a turn where they are straight, and falls as the joint flexes.
-            between = lower - _MAX_OVERTRAVEL <= np.pi - high and np.pi - low <= upper + _MAX_OVERTRAVEL
+            between = near_limits(np.pi - high, np.pi - low, limits)
             straight = "if it is 180 degrees where the finger is straight, write scale = -1.0 and offset = 180.0 (deg)"
             message += f"{straight}, or else correct its zero or the limits" if between else "correct one or the other"
             report.warning(place, message)
@@ -147,8 +147,7 @@ def _mend_of_turns(q: Float[np.ndarray, " N"], low: float, high: float, limits: 
     3. Else the joint may also turn on and on.
     """
     other = conversion("deg") if max(-low, high) < _MAX_DEGREES else "convert counts to rad (`scale` in a mapping)"
-    lower, upper = limits[0] - _MAX_OVERTRAVEL, limits[1] + _MAX_OVERTRAVEL
-    fits = lower <= np.radians(low) and np.radians(high) <= upper and np.ptp(limits) < 2.0 * np.pi - _MAX_OVERTRAVEL
+    fits = near_limits(np.radians(low), np.radians(high), limits) and np.ptp(limits) < 2.0 * np.pi - MAX_OVERTRAVEL
     if fits or np.all(q == np.round(q)):
         return other
     return f"{other}, or, if the joint turns on, write {limits_of_turns(low, high)}"

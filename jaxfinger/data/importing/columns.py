@@ -20,7 +20,7 @@ from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
 from jaxfinger.data.signals.unmeasured import placeholder
 from jaxfinger.data.toml import Place
-from jaxfinger.data.units import TO_SI, limits_of_turns, unit_name, whole_turns
+from jaxfinger.data.units import TO_SI, limits_of_turns, near_limits, unit_name, whole_turns
 from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
@@ -37,8 +37,9 @@ _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
 # Coarse stamps repeat regularly: as many samples to each, within one or a fifth, with room for jitter. Fewer repeated
 # stamps may be samples that were logged twice, and fewer stamps show no regularity.
 _MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR, _MAX_UNEVEN = 0.1, 10, 0.9, 0.2
-_MIN_DEGREES = 20.0  # Over fewer no joint is moved: that many rad are then those of one that turns on.
-_MAX_OVERTRAVEL = 0.35  # rad beyond a joint's limits, since stated limits are approximate
+# Least range, degrees, over which a trial moves a joint. Numbers that are called rad, and run over less than this, are
+# not degrees by mistake: the joint turns on.
+_MIN_DEGREES = 20.0
 _PARTS = "choose one part by `where`, or by `rate_hz` and `span`"
 _OWN_PARTS = "give each part a file of its own"
 
@@ -263,9 +264,8 @@ class ColumnReader:
         of = [(term, self._source(term, where).variable(term.from_, where)) for term in terms(spec)]
         if all(unit_name(v.units) == (term.units or "rad") and term.scale in (1.0, -1.0) for term, v in of):
             stated = listed(list(dict.fromkeys(variable.units for _, variable in of)))
-            degrees = np.radians((low, high))
-            fits = stated == "rad" and high - low > _MIN_DEGREES and limits.min() - _MAX_OVERTRAVEL <= degrees[0]
-            fits = fits and degrees[1] <= limits.max() + _MAX_OVERTRAVEL
+            fits = near_limits(np.radians(low), np.radians(high), limits)
+            fits = fits and stated == "rad" and high - low > _MIN_DEGREES
             wrong = 'if they are degrees, write units = "deg" all the same; ' if fits else ""
             where.fail(
                 f"runs from {low:.3g} to {high:.3g} rad, more than a turn, and the recording states {stated}; {wrong}"

@@ -70,7 +70,8 @@ def load_csv(path: Path) -> Recording:
     above = [line for line in lines if line.number < body[first].number]
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
     blank = not any(row[-1] for row in rows)
-    names, units, scope = _names(above, dialect, len(numeric), blank)
+    heads = _heads(above, dialect, len(numeric), blank)
+    names, units, scope = _names(heads, dialect, len(numeric))
     states = None if names else joint_states(rows, dialect.number)
     before = split(body[first - 1].text) if first > 0 else []
     # A recording may begin within a line, or after a message of the board.
@@ -100,10 +101,7 @@ def load_csv(path: Path) -> Recording:
     degrees = _IN_DEGREES.search("\n".join(line.text for line in above))
     angles = _ANGLES[degrees[1].lower()] if degrees else ""
     recording = replace(_named(path, columns, names, units, remarks), angles=angles)
-    if labview.TIMES not in names and not any(name.endswith(".time") for name in names):
-        return recording
-    header = {row[0]: row for row in _heads(above, dialect, len(numeric), blank)}
-    return labview.timed(recording, header, dialect.number)
+    return labview.timed(recording, heads, dialect.number) if labview.wrote(heads) else recording
 
 
 def _without_words(
@@ -147,34 +145,32 @@ def _holds_numbers(dialect: Dialect, cells: Sequence[str], numeric: Sequence[boo
     return values[:1] != [None] and 2 * count > len(values) and (len(cells) == len(numeric) or count == len(cells))
 
 
-def _names(
-    above: Sequence[Line], dialect: Dialect, width: int, blank: bool
-) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+def _names(heads: labview.Heads, dialect: Dialect, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names of the columns, their units, and whether they are pairs of time and value as TwinCAT Scope writes them.
 
-    The names are the nearest line above the numbers that has a cell for each column and holds no units. They may stand
-    behind a comment mark (numpy.savetxt, gnuplot). Either they or the numbers may end with a separator, after which the
-    last column is `blank`.
+    The names are the nearest of `_heads` that holds no units.
     """
-    rows = _heads(above, dialect, width, blank)
-    labelled = {row[0]: tuple(row) for row in rows if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
+    labelled = {row[0]: tuple(row) for row in heads if row[::2] == row[:1] * (width // 2) and width % 2 == 0}
     if _SCOPE in labelled and "Name" in labelled:
         return labelled["Name"], labelled.get("Unit", ("",) * width), True
-    header = {row[0]: row for row in rows}
-    words = [row for row in rows if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
+    if labview.wrote(heads):
+        return *labview.columns(heads), False
+    words = [row for row in heads if sum(_is_word(dialect, cell) for cell in row) * 2 > width]
     units = ("",) * width
     if len(words) > 1 and all(_is_unit(cell) for cell in words[0]):
         units = tuple(cell.strip("[]()") for cell in words.pop(0))
     names = tuple(words[0]) if words else ()
-    if labview.UNITS in header and names[:1] == (labview.TIMES,):
-        names, units = labview.columns(names, header)
-    elif len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
+    if len(words) > 1 and len(set(names)) < len(names):  # Names below those of groups, as pandas writes two levels.
         names = tuple(".".join(filter(None, pair)) for pair in zip(words[1], names, strict=True))
     return names, units, False
 
 
 def _heads(above: Sequence[Line], dialect: Dialect, width: int, blank: bool) -> list[list[str]]:
-    """Cells of the lines above the numbers that have one for each column, the nearest first."""
+    """Cells of the lines above the numbers that have one for each column, the nearest first.
+
+    They may stand behind a comment mark (numpy.savetxt, gnuplot). Either they or the numbers may end with a separator,
+    after which the last column is `blank`.
+    """
     rows = []
     for line in reversed(above):
         text = line.text.strip()

@@ -14,13 +14,12 @@ from jaxfinger.data.importing.speeds import speeds
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import quoted
-from jaxfinger.data.units import EITHER, TO_SI, spelt_unit
+from jaxfinger.data.units import EITHER, MAX_OVERTRAVEL, TO_SI, near_limits, spelt_unit
 from jaxfinger.errors import listed
 
 _MAX_SPEEDS = 4  # that are named
 # SI units of a sliding joint's position and force, and their largest plausible values, with room for gantries.
 _MAX_SLIDING = {"q": ("m", 2.0), "joint_torque": ("N", 500.0)}
-_MAX_OVERTRAVEL = 0.35  # rad beyond a joint's limits, since stated limits are approximate
 _MOST_OF_A_TURN = 6.0  # rad
 _USUAL_RATES = 100, 1000  # Hz
 
@@ -108,7 +107,7 @@ def turns_line(columns: Sequence[ColumnSurvey], limits: np.ndarray) -> list[str]
         return []
     low, high = min(s.low for s in guessed), max(s.high for s in guessed)
     turn = TO_SI["turn"].factor
-    if turn * low < limits.min() - _MAX_OVERTRAVEL or turn * high > limits.max() + _MAX_OVERTRAVEL:
+    if not near_limits(turn * low, turn * high, limits.ravel()):
         return []
     said = [f"{np.degrees(low * f):.0f} to {np.degrees(high * f):.0f} degrees" for f in (1.0, turn)]
     return [f"# q runs from {said[0]} if in rad, and from {said[1]} if in turns, as some motor drives count"]
@@ -121,7 +120,7 @@ def within(seen: ColumnSurvey, limits: np.ndarray | None) -> ColumnSurvey:
     """
     if seen.meaning != "q" or seen.units != "rad" or limits is None or not _is_guessed(seen):
         return seen
-    farther = float(np.ptp(limits)) + 2.0 * _MAX_OVERTRAVEL < seen.high - seen.low < _MOST_OF_A_TURN
+    farther = float(np.ptp(limits)) + 2.0 * MAX_OVERTRAVEL < seen.high - seen.low < _MOST_OF_A_TURN
     return replace(seen, units="") if farther else seen
 
 

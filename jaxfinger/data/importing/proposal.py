@@ -126,11 +126,9 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
     lines += [f"joint = {quoted(joint)}   # that is moved, or held by the torque sensor"] if joint else []
     lines += [f"tendon = {quoted(tendon)}   # that is pulled"] if tendon else []
     coarse = None if logs[0].repeats else coarse_rate(time)
-    guessed = (
-        "   # guessed: its values rise evenly"
-        if clock is not None and is_nameless(clock.name) and not clock.stated
-        else ""
-    )
+    guessed = ""
+    if clock is not None and is_nameless(clock.name) and not clock.stated:
+        guessed = "   # guessed: its values rise evenly"
     if clock is not None and logs[0].counts(clock):
         guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"
     if clock is None:
@@ -181,7 +179,8 @@ def _choose_families(
         # Without a finger, the angles tell how many joints have a torque.
         if families := _families(columns, len(known) or len(channels.get("q", ())), known):
             columns, *rivals[channel] = families
-        channels |= {channel: columns} if columns else {}
+        if columns:
+            channels[channel] = columns
     return rivals
 
 

@@ -128,10 +128,10 @@ def columns_of(
             if not (units or foreign or counts):
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
-                units = (
-                    "" if meaning == "q" and finite.any() and _may_be_geared(name, variable, units, owners) else units
-                )
-                guessed |= {len(found): np.nanmax(sizes)} if meaning in _MAX_VALUES and np.isfinite(sizes).any() else {}
+                if meaning == "q" and finite.any() and _may_be_geared(name, variable, units, owners):
+                    units = ""
+                if meaning in _MAX_VALUES and np.isfinite(sizes).any():
+                    guessed[len(found)] = np.nanmax(sizes)
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
             found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign, whole))

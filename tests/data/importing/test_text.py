@@ -190,3 +190,18 @@ def test_labview_may_write_times_before_each_channel_or_only_their_step(tmp_path
     found = written(tmp_path, "\t{a}\t{f}\t", head, "none.lvm")
     np.testing.assert_allclose(found.variables["X_Value"].values, TIME, atol=1e-12)
     assert 'time = "X_Value"\n' in proposal([found])
+
+
+def test_a_name_alone_makes_no_clock_of_a_column(tmp_path):
+    """Only below LabVIEW's header is `angle.time` the clock of `angle`."""
+    found = written(tmp_path, "{t:.2f},{a},{f}", "angle.time,angle,force\n", "log.csv")
+    assert [v.clock for v in found.variables.values()] == ["", "", ""]
+
+
+def test_labview_need_not_state_units(tmp_path):
+    head = LVM[: LVM.index("Channels")] + "X0\t0.0\t\t0.0\t\nX_Value\tangle\tX_Value\tforce\tComment\n"
+    found = written(tmp_path, "{t:.2f}\t{a}\t{t:.2f}\t{f}\t", head, "log.lvm")
+    assert {name: v.clock for name, v in found.variables.items() if v.clock} == {
+        "angle": "angle.time",
+        "force": "force.time",
+    }
