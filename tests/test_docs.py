@@ -89,7 +89,7 @@ def shelf(tmp_path_factory):
     (folder / "finger.toml").write_text(f"{text}\n{terms}", encoding="utf-8")
     page = (ROOT / "docs" / "add-an-effect.md").read_text(encoding="utf-8")
     (folder / "drag.py").write_text(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], encoding="utf-8")
-    columns = "time,angle knuckle,angle middle,force A,force B,length A,length B"
+    columns = "time,angle knuckle,angle middle,force A (N),force B (N),length A (mm),length B (mm)"
     swing = [40.0 - 30.0 * math.cos(0.02 * k) for k in range(1200)]
     rows = [f"{0.02 * k:.2f},{q:.4f},20,2,2,{0.14 * q:.5f},{-0.14 * q:.5f}" for k, q in enumerate(swing)]
     hand = "<worldbody>{}</worldbody>"

@@ -58,6 +58,7 @@ def new(
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path
     from jaxfinger.data.importing.templates import finger_template, mapping_template
+    from jaxfinger.data.importing.variables import UNKNOWN
 
     specimen = _asked("Name of the finger", specimen, "finger 1")
     if robot is not None:
@@ -89,6 +90,8 @@ def new(
     left = "replace its numbers by those of your finger" if robot is None else f"from {robot.name}"
     print(plain(f"{finger}: {count}; {left}"))
     todo = "correct what was guessed" if recordings else "name your recordings and their columns"
+    if recordings and (unknown := mapped.count(f'"{UNKNOWN}"')):
+        todo = f'fill in {unknown} "{UNKNOWN}", {todo}'
     print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
 
 

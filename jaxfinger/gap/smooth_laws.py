@@ -64,11 +64,12 @@ def features(
     }
     for i in own:
         u = _unit(q[i])
-        out["q"] += [np.cos(k * np.arccos(u)) for k in range(1, 7)]
+        chebyshev = [np.cos(k * np.arccos(u)) for k in range(7)]
+        out["q"] += chebyshev[1:]
         v = _unit(qd[i])
-        out["qd"] += [v, v**2, v**3, v * u, v * u**2]
+        out["qd"] += [v**2, v**3] + [v * p for p in chebyshev[:4]]
         out["qd"] += [np.exp(-np.abs(qd[i]) / w) for w in np.multiply(SPEEDS, scales.speed[i])]
-        out["direction"] += [direction[i] * u**p for p in range(3)]
+        out["direction"] += [direction[i] * p for p in chebyshev[:3]]
         travelled = since_reversal(_smoothed(q[i]))
         for length in np.multiply(LENGTHS, scales.angle[i]):
             out["distance since reversal"] += [

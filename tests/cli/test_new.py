@@ -107,6 +107,7 @@ def test_which_joint_a_sensor_holds_is_not_guessed(tmp_path, capsys):
     foreign(tmp_path / "pull.csv", pulls="B", torque=True)
     written = [f"{tmp_path}/f.toml", f"{tmp_path}/m.toml"]
     main(["new", *written, f"{tmp_path}/pull.csv", "--joints", "knuckle,middle", "--tendons", "cable A,cable B"])
+    assert 'fill in 2 "?"' in capsys.readouterr().out
     with pytest.raises(SystemExit) as stopped:
         main(["import", f"{tmp_path}/pull.csv", "--mapping", written[1], "-o", f"{tmp_path}/s.h5"])
     assert stopped.value.code == 2
