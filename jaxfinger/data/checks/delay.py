@@ -3,6 +3,8 @@
 1. ID.3-dynamic: the torque of the joint follows from its angle, direction, speed and acceleration.
 2. ID.2: the excursion of a tendon follows from the joint's angle and direction, and from the tensions.
 
+What turns with the direction, friction, depends on the angle too.
+
 The left side is regressed on the right one and shifted in time until least is left over. Friction with pre-sliding and
 play seem late too, but by a travel instead of a time. A shift is therefore called a delay only if
 
@@ -42,6 +44,7 @@ from jaxfinger.data.signals.sizes import SWEEP_TIME, travel_time
 from jaxfinger.errors import listed
 
 _DEGREE = 5  # of torque and excursion as polynomials of the angle, as in `checks.work`
+_FRICTION_DEGREE = 1  # of friction as a polynomial of the angle; more terms would hold a part of a filter's lag
 _REST_SHARE = 0.02  # of the highest speed: slower samples may be at rest, where friction takes any value.
 # Longest delay that is looked for, in times that a tenth of the travel takes: 20 are two thirds of the period of a
 # sine, after which it repeats.
@@ -123,14 +126,15 @@ def _motion(trial: Trial, joint: int, channel: str, columns: np.ndarray) -> _Mot
         return None
     cutoff, step = fitting_cutoff(time, cutoff), float(time[1] - time[0])
     q, rate, acceleration = smooth(time, angle, cutoff)
-    filtered = low_pass(time, np.column_stack([y, np.sign(rate), given]), cutoff)
+    powers = np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), _DEGREE)
+    friction = np.sign(rate)[:, None] * powers[:, : _FRICTION_DEGREE + 1]
+    filtered = low_pass(time, np.column_stack([y, friction, given]), cutoff)
     y, given = filtered[:, : len(columns)], filtered[:, len(columns) :]
     longest = int(min(LONGEST_SHARE * len(time), _LONGEST_TRAVELS * travel / step))
     moves = np.abs(rate) > _REST_SHARE * np.percentile(np.abs(rate), 95)
     moves[:longest] = moves[len(time) - longest :] = False
     if moves.sum() < MIN_SAMPLES:
         return None
-    powers = np.polynomial.polynomial.polyvander((q - q.mean()) / np.ptp(q), _DEGREE)
     X = np.column_stack([powers, given, *((rate, acceleration) if channel == "joint_torque" else ())])
     y = (y - y[moves].mean(axis=0)).T
     return _Motion(trial, columns, cutoff, travel, longest, time, angle, rate, moves, X, y)

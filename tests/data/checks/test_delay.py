@@ -11,6 +11,7 @@ from jaxfinger.data.checks.delay import check_delay
 from jaxfinger.data.checks.pulls import check_pulls
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import Session
+from jaxfinger.synthetic import recipe_from, simulate
 from tests.data.checks.sweeps import Sweep, alone, late, led, play, pre_sliding, pulled, swept
 
 SEVERAL, ONE = Sweep(), Sweep((0.5,), lasts=20.0)
@@ -105,6 +106,15 @@ def test_friction_that_grows_with_load_is_no_delay(session, share):
     load = 0.3 * np.sin(q) + 0.01 * np.gradient(rate, time)
     torque = load + 0.02 * rate + share * np.abs(load) * np.tanh(rate / 0.02)
     assert delays(session, swept(servo, q, torque)) == []
+
+
+def test_friction_that_depends_on_posture_is_neither_a_delay_nor_a_filter():
+    """Friction of the paper's MCP rises from 2.5 to 11 N mm through its range, which all strokes cross at one speed."""
+    sweeps = {"experiments": ["ID.3-dynamic"], "id3_dynamic": {"cycles": 5}}
+    session = simulate(recipe_from({"specimen": {"kind": "polynomial"}, "trials": sweeps}), seed=0)
+    report = Report()
+    check_delay(session, report)
+    assert not list(report)
 
 
 def pulls(session, **how) -> list[str]:
