@@ -12,9 +12,11 @@ import numpy as np
 from jaxfinger.data.findings import Report
 from jaxfinger.data.importing.expressions import ExpressionError, evaluate
 from jaxfinger.data.importing.mapping import Column, ColumnSpec, MappedTrial, Reading, terms
+from jaxfinger.data.importing.names import is_time_step
 from jaxfinger.data.importing.readings import compare_units, converted, is_slower, period
 from jaxfinger.data.importing.recording import Variable
 from jaxfinger.data.importing.rounding import evened
+from jaxfinger.data.importing.stamps import coarse_rate, increasing_order, restarts
 from jaxfinger.data.importing.variables import Source, column_of, scale_of
 from jaxfinger.data.signals.clock import gaps
 from jaxfinger.data.signals.sizes import MAX_RATE
@@ -31,12 +33,6 @@ if TYPE_CHECKING:
 _MAX_CLOCK_RATIO = 30.0
 _MIN_COVERAGE = 0.5  # of a trial: a clock that covers less is taken to be a wrong one.
 _MIN_SAMPLES = 10  # within the trial: fewer show no motion.
-# A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
-# back between two longer runs of samples begins another recording, or wraps.
-_MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
-# Coarse stamps repeat regularly: as many samples to each, within one or a fifth, with room for jitter. Fewer repeated
-# stamps may be samples that were logged twice, and fewer stamps show no regularity.
-_MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR, _MAX_UNEVEN = 0.1, 10, 0.9, 0.2
 # Least range, degrees, over which a trial moves a joint. Numbers that are called rad, and run over less than this, are
 # not degrees by mistake: the joint turns on.
 _MIN_DEGREES = 20.0
@@ -108,6 +104,10 @@ def _times(reading: Reading, source: Source, where: Place, report: Report) -> Fl
     """Times of a clock, s."""
     variable = source.variable(reading.from_, where)
     values, _ = column_of(variable, reading.from_, reading.column, where)
+    if is_time_step(reading.from_, values):
+        known = f"{reading.from_}.time" in source.recording.variables
+        mend = f"their sum, {reading.from_}.time" if known else "the clock, or write `rate_hz`"
+        where.fail(f"reads {reading.from_!r}, which holds the times between samples; name {mend}")
     compare_units(variable, reading, "s", report, where, reading.from_ in source.derived)
     return converted(values, reading, "s", scale_of(reading, source, where), where)
 
@@ -164,68 +164,6 @@ def _stamped(time: np.ndarray, name: str, where: Place, report: Report) -> np.nd
         count = counted(int((~good).sum()), "sample")
         report.warning(where.key, f"the clock {name} gives no time for {count}, left out; mend the recording")
     return good
-
-
-def restarts(time: np.ndarray) -> np.ndarray:
-    """Indices of the samples after which a clock, s, begins again or wraps: it runs back further than late stamps do,
-    and runs on from there."""
-    steps = np.diff(time)
-    back = np.flatnonzero(steps < 0.0)
-    if not len(back):
-        return back
-    late = max(_MAX_LATE, _MAX_LATE_SAMPLES * float(np.nanmedian(np.abs(steps))))
-    runs = np.diff(np.concatenate([[-1], back, [len(time) - 1]]))
-    return back[(steps[back] < -late) & (np.minimum(runs[:-1], runs[1:]) > _MAX_LATE_SAMPLES)]
-
-
-def coarse_rate(time: np.ndarray) -> tuple[float, float] | None:
-    """Step, s, of stamps that are coarser than the samples, and the samples' rate, Hz; None where they are not.
-
-    Each coarse stamp is regularly that of several samples, since its last digits are cut.
-    """
-    stamps, counts = np.unique(time, return_counts=True)
-    if (np.diff(time) < 0.0).any() or len(time) < (1.0 + _MIN_REPEATED) * len(stamps) or len(stamps) < _MIN_STAMPS:
-        return None
-    steps, counts = np.diff(stamps), counts[1:-1]  # The recording may begin and end within a stamp.
-    step, shared = float(np.median(steps)), float(counts.mean())
-    regular = (np.abs(counts - shared) <= max(1.0, _MAX_UNEVEN * shared)).mean() > _MIN_REGULAR and np.ptp(
-        steps
-    ) < 0.5 * step
-    return (step, shared / step) if regular else None
-
-
-def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where: Place, report: Report) -> np.ndarray:
-    """Indices that put times into increasing order, without repeated ones. `choice` says how to read one part of them.
-
-    Raises:
-        UserError: the times begin again, or do not increase and `sort` is false.
-    """
-    late = np.diff(time) <= 0.0
-    if not late.any():
-        return np.arange(len(time))
-    begins = restarts(time)
-    if len(begins):
-        far = f"runs back by {time[begins[0]] - time[begins[0] + 1]:.4g} s after sample {begins[0]}"
-        far += f", and at {counted(len(begins), 'place')} in all" if len(begins) > 1 else ""
-        wraps_after = time[begins[0]] - time[begins[0] + 1] + float(np.median(np.diff(time)))
-        where.fail(
-            f"the clock {name} {far}: it begins again or wraps, and sorting would mix different times; {choice}, or "
-            f"unwrap a clock that wraps after {wraps_after:.6g} s by its period in its own units, as "
-            "time = { from = …, unwrap = 4294967296 }"
-        )
-    at, back, twice = int(np.argmax(late)), int((np.diff(time) < 0.0).sum()), int((np.diff(np.sort(time)) == 0.0).sum())
-    if not sort:
-        count = f"does not increase at {int(late.sum())} of {len(time)} samples, first after sample {at}"
-        mend = "the samples must be sorted by their time"
-        mend += f", without the {counted(twice, 'sample')} at repeated stamps" if twice else ""
-        if twice > 0.5 * len(time):
-            where.fail(f"the clock {name} {count}: its stamps are too coarse; write rate_hz in place of `time`")
-        where.fail(f"the clock {name} {count}: {mend}; have import do so by `sort = true` in the trial")
-    order = np.argsort(time, kind="stable")
-    first = np.concatenate([[True], np.diff(time[order]) > 0.0])
-    left = f"{counted(back, 'stamp')} ran back, and {counted(twice, 'sample')} at repeated stamps left out"
-    report.warning(where.key, f"the clock {name} was sorted, {left}")
-    return order[first]
 
 
 @dataclass

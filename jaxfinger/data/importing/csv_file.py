@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxfinger.data.importing import labview
-from jaxfinger.data.importing.dialect import MISSING, Dialect, find_dialect
+from jaxfinger.data.importing.dialect import Dialect, find_dialect, is_missing
 from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.importing.text_columns import Column, read_columns
@@ -40,10 +40,10 @@ _SCOPE = "SampleTime[ms]"  # header of TwinCAT Scope, which writes a column of t
 def load_csv(path: Path) -> Recording:
     """Load the columns of a CSV file by the names above the numbers, or as `column 0`, `column 1` and so on.
 
-    Empty cells and words for a missing value (`-`, `#N/A`) are NaN, True and False are 1 and 0, dates with a time of
-    day are seconds since 1970, and times of day seconds since midnight. A column of lists in brackets, one a sample, is
-    an array. A column of words can be tested, not computed with. Messages of a JointState that `ros2 topic echo --csv`
-    wrote have the names of its fields.
+    Empty cells and marks of a missing value (`-`, `---`, `n/c`, `#N/A`) are NaN, True and False are 1 and 0, dates with
+    a time of day are seconds since 1970, and times of day seconds since midnight. A column of lists in brackets, one a
+    sample, is an array. A column of words can be tested, not computed with. Messages of a JointState that `ros2 topic
+    echo --csv` wrote have the names of its fields.
 
     Raises:
         UserError: the file has no column of numbers, or a line with another number of cells.
@@ -113,7 +113,9 @@ def _without_words(
     kept, said = [], []
     for line in body:
         cells = dialect.split(line.text) if usual(line.text) != width or line.text.startswith(names[:1]) else None
-        numbers = cells is None or any(dialect.number(cell) is not None for cell in cells if cell)
+        numbers = cells is None or any(
+            dialect.number(cell) is not None for cell in cells if cell and not is_missing(cell)
+        )
         of_words = cells is not None and not numbers and (len(cells) != width or tuple(cells) == names)
         (said if of_words else kept).append(line)
     return kept, said
@@ -195,7 +197,7 @@ def _is_unit(cell: str) -> bool:
 
 def _is_word(dialect: Dialect, cell: str) -> bool:
     """Whether a cell above the numbers is a name or a unit; `-` is the unit of a ratio."""
-    return dialect.number(cell) is None or cell.lower() in MISSING
+    return dialect.number(cell) is None or is_missing(cell)
 
 
 def _named(

@@ -18,22 +18,15 @@ from jaxfinger.data.importing.dates import seconds
 from jaxfinger.data.units import is_foreign, unit_name
 
 _BOOLEANS = {"true": 1.0, "false": 0.0}
-# What programs write for a missing value: words, errors of spreadsheets, and NaN of Microsoft's C library.
-SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#name?")
-MISSING = {
-    "-",
-    "--",
-    "na",
-    "n/a",
-    "null",
-    "none",
+# What programs and people write for a missing value: marks without letters and digits, words, errors of spreadsheets,
+# and NaN of Microsoft's C library.
+SHEET_ERRORS = ("#n/a", "#div/0!", "#value!", "#num!", "#null!", "#ref!", "#name?", "#nv", "#wert!", "#zahl!")
+_MARK = re.compile(r"[-\u2010-\u2015*?.]+")
+_MISSING = {
+    *("na", "n/a", "n.a.", "n. a.", "nc", "n/c", "n.c.", "nd", "n/d", "n.d."),
+    *("null", "nil", "none", "missing", "no data", "no value", "no signal", "not available", "not connected"),
     *SHEET_ERRORS,
-    "1.#qnan",
-    "-1.#ind",
-    "1.#ind",
-    "-nan(ind)",
-    "1.#inf",
-    "-1.#inf",
+    *("1.#qnan", "-1.#ind", "1.#ind", "-nan(ind)", "1.#inf", "-1.#inf"),
 }
 _FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)$")  # a number of double precision
 _QUANTITY = re.compile(r"[+-]?\d[\d.,]*(?:[eE][+-]?\d+)?\s*([A-Za-zµ°%][A-Za-z °·*/]*)")
@@ -138,4 +131,9 @@ def _cell(cell: str) -> float | None:
         return float(f"{at[1]}e{at[2]}")
     if cell.lower() in _BOOLEANS:
         return _BOOLEANS[cell.lower()]
-    return np.nan if not cell or cell.lower() in MISSING else None
+    return np.nan if not cell or is_missing(cell) else None
+
+
+def is_missing(cell: str) -> bool:
+    """Whether a cell says that its value is missing, as `-`, `---`, `n/c` and `#N/A` do."""
+    return cell.lower() in _MISSING or _MARK.fullmatch(cell) is not None

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfinger.data.importing.names import Owners, meaning_of
+from jaxfinger.data.importing.names import is_clock
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.units import TO_SI, unit_name, without_units
 from jaxfinger.errors import listed
@@ -48,7 +48,7 @@ def widened(recording: Recording) -> Recording:
         for label in dict.fromkeys(labels.tolist())
     }
     first = next(iter(parts.values()))
-    clock = next((name for name, v in first.variables.items() if _is_clock(name, v)), "")
+    clock = next((name for name, v in first.variables.items() if is_clock(name, v.values, v.units)), "")
     shared = not clock or all(
         np.array_equal(part.variables[clock].values, first.variables[clock].values) for part in parts.values()
     )
@@ -117,12 +117,6 @@ def _takes_turns(x: np.ndarray) -> bool:
     if not 1 < period <= _MAX_LABELS < len(x):
         return False
     return bool(np.mean(x[1:] != x[:-1]) > _MIN_CHANGES and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC)
-
-
-def _is_clock(name: str, variable: Variable) -> bool:
-    """Whether a column of the rows of one signal holds their times, by its name."""
-    x = variable.values
-    return x.ndim == 1 and meaning_of(name, None, x, variable.units, Owners((), ()))[0] == "time"
 
 
 def _in_seconds(clock: Variable) -> Variable:

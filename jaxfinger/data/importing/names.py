@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxfinger.data.importing.columns import coarse_rate
+from jaxfinger.data.importing.stamps import coarse_rate
 from jaxfinger.data.units import TO_SI, spelt_unit, unit_name, weight_unit, without_units
 
 # Patterns of names for each channel, of which the first that fits counts: common words in logs of robots.
@@ -32,6 +32,9 @@ _MEANINGS = (
 # pasted twice.
 _MIN_RUNNING = 0.5
 _NO_WORDS = "value", "data"  # at the end of a name, which say nothing of what they are: the word before them does
+# Name of the time since the sample before.
+_TIME_STEP = r"[dΔδ∆]_?t|(delta|diff|step|cycle|loop)_?t(ime)?|t(ime)?_?(delta|diff|step)"
+_TIME_STEP += r"|(time|sample|sampling)_?(interval|period)"
 # Name of a column of a table without names, or one that says no more: programs that draw curves call times x.
 _NAMELESS = r"column \d+|x([ _-]?(value|axis)s?)?"
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
@@ -104,6 +107,22 @@ def is_speed(name: str) -> bool:
     return is_nameless(name) or re.search(_VELOCITY, name.lower()) is not None
 
 
+def is_time_step(name: str, x: np.ndarray) -> bool:
+    """Whether a column holds the times between samples in place of times: by its name, and since it goes up and down
+    as often, or stays the same, where a clock goes on."""
+    word = re.sub(r"_(s|sec|ms|us|ns)$", "", words(re.split(r"[./]", without_units(name))[-1]))
+    x = x[1:][np.isfinite(x[1:])]  # The first sample has none before it.
+    if x.ndim > 1 or re.fullmatch(_TIME_STEP, word) is None or np.any(x < 0.0) or not np.any(x > 0.0):
+        return False
+    ups, downs = (np.count_nonzero(sign * np.diff(x) > 0.0) for sign in (1.0, -1.0))
+    return bool(ups <= 2 * downs)
+
+
+def is_clock(name: str, x: np.ndarray, stated: str) -> bool:
+    """Whether a column with these values and stated units holds times, by its name."""
+    return x.ndim == 1 and meaning_of(name, None, x, stated, Owners((), ()))[0] == "time"
+
+
 def meaning_of(name: str, column: str | int | None, x: np.ndarray, stated: str, owners: Owners) -> tuple[str, str]:
     """Channel or `time` by the last word of a name where its units allow it, else by these; and the units, if any.
 
@@ -117,7 +136,12 @@ def meaning_of(name: str, column: str | int | None, x: np.ndarray, stated: str, 
     owner, rest = owners.of(words(word))
     rest = rest or (words(before[-1]) if before else "")
     texts = [word.lower(), *([f"{rest}_{owner}", rest] if owner and rest else [])]
-    if len(x) == 1 or is_set_point(name) or any(re.search(p, text) for p in (_VELOCITY, _STATE) for text in texts):
+    if (
+        len(x) == 1
+        or is_set_point(name)
+        or is_time_step(name, x)
+        or any(re.search(p, text) for p in (_VELOCITY, _STATE) for text in texts)
+    ):
         return "", units
     found = next((m for text in texts if (m := _channel(text, units, text == texts[0]))), "")
     if found == "time":

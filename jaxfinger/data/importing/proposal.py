@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.data.importing.assignment import assigned, held_names, known_names, named_columns
-from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.experiment import guessed_experiment
 from jaxfinger.data.importing.leverage import surveyed
 from jaxfinger.data.importing.lines import (
@@ -27,7 +26,9 @@ from jaxfinger.data.importing.lines import (
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import MOTOR, is_nameless, is_set_point, words
 from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.stamps import coarse_rate, restarts
 from jaxfinger.data.importing.survey import ColumnSurvey, weight_on_reach
+from jaxfinger.data.importing.time_steps import steps_of
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.toml import as_key, quoted
 from jaxfinger.data.units import TO_SI, beyond_a_turn
@@ -131,6 +132,8 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
         guessed = "   # guessed: its values rise evenly"
     if clock is not None and logs[0].counts(clock):
         guessed = "   # it counts by one: if it counts samples, write `rate_hz`, samples per second, in its place"
+    if clock is not None and (steps := steps_of(recording, clock.name)):
+        guessed = f"   # the sum of the steps of time in {quoted(steps)}"
     if clock is None:
         lines.append('time = "?"   # no time was found: name its variable, or write `rate_hz`, samples per second')
         lines += pace_line(logs[0], channels.get("q", ()))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxfinger.data.importing.dates import packed, texts
 from jaxfinger.data.importing.long_table import widened
 from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.importing.time_steps import with_summed_steps
 from jaxfinger.data.opening import plain_reason
 from jaxfinger.errors import UserError, listed
 
@@ -40,7 +41,7 @@ def load_recording(path: Path) -> Recording:
     Raises:
         UserError: the file is missing, empty, of an unknown kind, damaged, or without numbers.
     """
-    recording = widened(_with_dates(_load(path)))
+    recording = with_summed_steps(widened(_with_dates(_load(path))))
     if not recording.variables and recording.unusable:
         said = listed([f"{name} {reason}" for name, reason in recording.unusable.items()], 1)
         raise UserError(f"{path}: holds no variable of numbers: {said}")

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxfinger.data.example import is_example
-from jaxfinger.data.importing.columns import coarse_rate, restarts
 from jaxfinger.data.importing.names import (
     Owners,
     as_word,
@@ -21,6 +20,7 @@ from jaxfinger.data.importing.names import (
     words,
 )
 from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.importing.stamps import coarse_rate, restarts
 from jaxfinger.data.mounting import reach_of, weight_of
 from jaxfinger.data.session import FingerDescription
 from jaxfinger.data.units import TO_SI, is_foreign, is_ratio, is_unknown, spelt, without_units

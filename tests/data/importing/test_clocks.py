@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from jaxfinger.cli import main
+from jaxfinger.data.importing.by_mapping import import_session
 from jaxfinger.data.importing.proposal import proposal
 from jaxfinger.data.importing.sources import load_recording
 from jaxfinger.data.importing.survey import clocks_of, columns_of
-from tests.data.conftest import GAPPED_MS
+from jaxfinger.errors import UserError
+from tests.data.conftest import GAPPED_MS, ONE_JOINT
 
 
 def test_a_shuffled_clock_is_said_and_its_rate_is_that_of_sorted_stamps(tmp_path, capsys):
@@ -147,3 +149,54 @@ def test_coarse_stamps_are_replaced_by_a_rate(tmp_path, shared):
     assert 'rate_hz = 500   # several samples share each stamp of "t"' in said
     assert "time =" not in said
     assert "sort" not in said
+
+
+STEPS_MS = np.random.default_rng(3).choice([9.0, 10.0, 10.0, 11.0], 500)
+
+
+def stepped(folder, name, steps):
+    """A log with a column of steps, and the mapping that reads its proposed times."""
+    path = folder / "log.csv"
+    q = 40 + 30 * np.sin(np.arange(len(steps)) / 50)
+    np.savetxt(path, np.column_stack([steps, q]), "%.9f", ",", header=f"{name},angle_deg", comments="")
+    return path, proposal([load_recording(path)])
+
+
+def imported_times(folder, path, time):
+    mapping = folder / "m.toml"
+    trial = '[trials.a]\nexperiment = "ID.3-static"\njoint = "MCP"\n'
+    channels = 'channels.q.MCP = { from = "angle_deg", units = "deg" }\n'
+    channels += 'channels.joint_torque.MCP = { from = "angle_deg", scale = 1e-3, units = "N m" }\n'
+    mapping.write_text(f"{ONE_JOINT}\n{trial}{time}\n{channels}")
+    return next(iter(import_session([path], mapping))).time
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [("dt", 1e-3), ("dt", 1.0), ("delta_t", 1e-3), ("Δt [us]", 1e3), ("time_step", 1e-3), ("deltaTime_ms", 1.0)],
+)
+def test_the_sum_of_steps_of_time_is_a_clock(tmp_path, name, factor):
+    path, said = stepped(tmp_path, name, factor * STEPS_MS)
+    (time,) = (line for line in said.splitlines() if line.startswith("time = "))
+    assert f'# the sum of the steps of time in "{name}"' in time
+    np.testing.assert_allclose(imported_times(tmp_path, path, time)[-1], 1e-3 * STEPS_MS[1:].sum(), rtol=1e-6)
+
+
+def test_steps_of_time_are_not_read_as_times(tmp_path):
+    path, _ = stepped(tmp_path, "time_step", 1e-3 * STEPS_MS)
+    with pytest.raises(UserError, match=r"'time_step', which holds the times between samples; name their sum, time_st"):
+        imported_times(tmp_path, path, 'time = "time_step"')
+
+
+@pytest.mark.parametrize("values", [np.arange(500) / 100, np.repeat(np.arange(50), 10) / 10.0, STEPS_MS - 10.0])
+def test_a_name_alone_makes_no_steps_of_time(tmp_path, values):
+    """Times and numbers of steps go on, and no step of time is below zero."""
+    assert "the sum of" not in stepped(tmp_path, "time_step", values)[1]
+
+
+def test_steps_of_which_some_are_missing_have_no_sum(tmp_path):
+    steps = 1e-3 * STEPS_MS
+    steps[[0, 7]] = np.nan
+    said = stepped(tmp_path, "dt", steps)[1]
+    assert 'time = "?"' in said
+    assert '# "dt.time" has no sum, since 1 step of time cannot be read; fill in what is missing' in said

@@ -9,6 +9,7 @@ import pytest
 
 from jaxfinger.data.importing.csv_file import load_csv
 from jaxfinger.data.importing.proposal import proposal
+from jaxfinger.data.importing.survey import columns_of
 from jaxfinger.data.units import without_units
 from jaxfinger.errors import UserError
 
@@ -167,12 +168,23 @@ def test_decimal_commas_beside_dates_with_a_point(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "word", ["-", "--", "#N/A", "NA", "n/a", "NULL", "None", "nan", "#DIV/0!", "1.#QNAN", "-1.#IND", "1.#INF"]
+    "word",
+    [
+        *("-", "--", "---", "—", "***", "???", ".", "NA", "n/a", "N.A.", "n/c", "nc", "n.d.", "NULL", "None", "nan"),
+        *("#N/A", "#NV", "#DIV/0!", "1.#QNAN", "-1.#IND", "1.#INF"),
+    ],
 )
 def test_words_for_a_missing_value(tmp_path, word):
     found = load(tmp_path, f"a,t\n1,0\n{word},1\n3,2\n4,3\n")
     np.testing.assert_array_equal(found.variables["a"].values, [1, np.nan, 3, 4])
     assert found.unusable == {}
+
+
+def test_missing_values_are_counted(tmp_path):
+    """Also where they stand among units in cells; and a mark is no sample above the numbers."""
+    rows = "".join(f"{k},{'---' if k % 9 == 5 else k % 7} mm,{'n/c' if k % 8 == 3 else k % 5}\n" for k in range(90))
+    found = load(tmp_path, "t,l,f\n---,---,---\n" + rows.replace("--- mm", "---"))
+    assert [s.missing for s in columns_of(found)] == [0, 10, 11]
 
 
 def test_exponents_of_double_precision_are_numbers(tmp_path):
@@ -324,7 +336,7 @@ def test_lines_of_numbers_above_the_first_whole_sample_are_said(tmp_path):
     """Nothing that was recorded is left out without a word."""
     rows = [f"{k / 100},{k},{k}" for k in range(20)]
     assert load(tmp_path, "\n".join(["t,a,b", *rows])).remarks == ()
-    found = load(tmp_path, "\n".join(["t,a,b", "0.0,?,0", "0.01,?,1", *rows[2:]]))
+    found = load(tmp_path, "\n".join(["t,a,b", "0.0,x,0", "0.01,x,1", *rows[2:]]))
     assert found.remarks == ("has numbers in line 2 above its first whole sample, which are left out",)
     assert len(found.variables["t"].values) == 18
 

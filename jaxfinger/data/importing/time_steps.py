@@ -1,0 +1,43 @@
+"""Clocks of logs that write the time since the sample before in place of the time: the sum of these steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxfinger.data.importing.names import is_clock, is_time_step
+from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.units import spelt
+from jaxfinger.errors import counted
+
+_SUM = ".time"  # end of the name of the clock, behind that of the steps
+
+
+def with_summed_steps(recording: Recording) -> Recording:
+    """Recording whose column `dt` of steps, if nothing else is a clock by its name, has their sum as `dt.time`.
+
+    The first step, from a sample that was not recorded, may be missing.
+    """
+    variables, unusable = dict(recording.variables), dict(recording.unusable)
+    if any(is_clock(name, v.values, v.units) for name, v in variables.items()):
+        return recording
+    count = max((len(v.values) for v in variables.values()), default=0)
+    for name, variable in recording.variables.items():
+        steps = variable.values
+        if len(steps) < count or not is_time_step(name, steps):
+            continue
+        if lost := int(np.count_nonzero(~np.isfinite(steps[1:]))):
+            unusable[name + _SUM] = f"has no sum, since {counted(lost, 'step')} of time cannot be read; fill in what is missing"
+        else:
+            unit = variable.units or spelt(name)
+            variables[name + _SUM] = replace(variable, values=np.cumsum(np.nan_to_num(steps)), units=unit)
+        break
+    return replace(recording, variables=variables, unusable=unusable)
+
+
+def steps_of(recording: Recording, clock: str) -> str:
+    """Name of the steps of which a recording's clock is the sum; empty where it is recorded itself."""
+    name = clock.removesuffix(_SUM)
+    steps = recording.variables.get(name)
+    return name if name != clock and steps is not None and is_time_step(name, steps.values) else ""
