@@ -15,7 +15,7 @@ from jaxfinger.data.importing.dialect import Dialect, find_dialect, is_missing
 from jaxfinger.data.importing.joint_states import JointStates, joint_states
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.importing.text_columns import Column, read_columns
-from jaxfinger.data.importing.text_lines import COMMENTS, Line, is_comment, read_lines
+from jaxfinger.data.importing.text_lines import COMMENTS, MAX_QUOTED, Line, is_comment, read_lines
 from jaxfinger.data.units import is_foreign, is_ratio, stated_units, unit_name
 from jaxfinger.errors import UserError, counted
 
@@ -26,7 +26,6 @@ _UNIT_CELL = re.compile(rf"^[\[(]?({_UNIT}|{_UNIT}/s2?|)[\])]?$")
 # What OpenSim's tables of motion say in their header, of the angles among their columns, and the unit that it means.
 _IN_DEGREES = re.compile(r"^\s*inDegrees\s*=\s*(yes|no)\s*$", re.IGNORECASE | re.MULTILINE)
 _ANGLES = {"yes": "deg", "no": "rad"}
-_MAX_QUOTED = 40  # characters of a line
 _LOST = "A message was lost!!!", "\ttotal count"  # how lines begin that `ros2 topic echo` writes between messages
 _NO_CHANNEL = "comment"  # the last name in a LabVIEW measurement file, of cells that only the first sample may have
 # A frame of a CAN bus, with its bytes in hexadecimal, as `candump` and Vector's `.asc` write it.
@@ -85,7 +84,7 @@ def load_csv(path: Path) -> Recording:
     body, said = _without_words(dialect, body[first:], len(numeric), names)
     if said:
         count = counted(len(said), "line")
-        where = f"in line {said[0].number} ({said[0].text.strip()[:_MAX_QUOTED]!r})"
+        where = f"in line {said[0].number} ({said[0].text.strip()[:MAX_QUOTED]!r})"
         remarks = (*remarks, f"has {count} without numbers among its samples, the first {where}, left out")
     if not names and _numbers_columns(dialect, body):
         names, body = tuple(split(body[0].text)), body[1:]

@@ -12,8 +12,10 @@ The first gives the variables `angle_MCP` and `force_T1`, the second `MCP.positi
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Bool
@@ -21,22 +23,31 @@ from jaxtyping import Bool
 from jaxfinger.data.importing.names import is_clock
 from jaxfinger.data.importing.recording import Recording, Variable
 from jaxfinger.data.units import TO_SI, unit_name, without_units
-from jaxfinger.errors import listed
+from jaxfinger.errors import UserError, listed
 
 # Names of the column that says which signal a row is of, beside a column that is called a value; and of one that says
 # whose the row is.
 _SIGNAL = r"signal|topic|channel|kanal|variable|sensor|name|metric|field|measurement|quantity|parameter|key|tag|path"
-_WHOSE = r"(?=.)(joint|motor|servo|actuator|drive|axis|dof|tendon|finger|sensor|channel|device|node|can)?"
-_WHOSE += r"[_ ]?(name|id|index|number|no|nr)?"
+_WHOSE = (
+    r"(?=.)(joint|motor|servo|actuator|drive|axis|dof|tendon|finger|sensor|channel|device|dev|node|can|board|module"
+)
+_WHOSE += r"|source|src|sender|port|bus|message|msg|type|kind|tag)?[_ ]?(name|id|index|number|no|nr|type)?"
 _VALUE = r"(value|val|data|reading|wert|messwert|valeur)s?"
 _UNIT = r"units?|einheit"
 _MAX_LABELS = 100  # different signals; more are no names
-_MIN_CHANGES = 0.5  # of the rows: rows of several joints alternate, phases of an experiment do not.
+# Of the rows: rows of several joints alternate, also where one has ten for each of another, and phases of an experiment
+# do not. Numbers may change with a motion.
+_MIN_CHANGES, _MIN_CHANGES_OF_NUMBERS = 0.1, 0.5
+_FIRST = "column 0"  # name of the first column of a table without names
 _MIN_PERIODIC = 0.8  # of the rows: numbers of joints return in turn, other whole numbers do not.
 
 
 def widened(recording: Recording) -> Recording:
-    """Recording with a variable for each signal of a long table; other recordings as they are."""
+    """Recording with a variable for each signal of a long table; other recordings as they are.
+
+    Raises:
+        UserError: its rows begin with the tags of several devices, and its columns have no names.
+    """
     table = _rows_of(recording, slice(None))
     value = next((name for name in table.variables if re.fullmatch(_VALUE, _plain(name))), "")
     keys = _keys(table, bool(value))
@@ -100,13 +111,26 @@ def _keys(table: Recording, valued: bool) -> dict[str, list[str]]:
     found = {}
     for name, cells in table.words.items():
         several = 1 < len(np.unique(cells)) <= _MAX_LABELS
-        whose = bool(re.fullmatch(_WHOSE, _plain(name))) and np.mean(cells[1:] != cells[:-1]) > _MIN_CHANGES
+        alternates = np.mean(cells[1:] != cells[:-1]) > _MIN_CHANGES
+        if several and alternates and name == _FIRST:
+            _refuse_tags(table.path, list(dict.fromkeys(cells.tolist())))
+        whose = bool(re.fullmatch(_WHOSE, _plain(name))) and alternates
         if several and (whose or (valued and re.fullmatch(_SIGNAL, _plain(name)))):
             found[name] = cells.tolist()
     for name, variable in table.variables.items():
+        if name == _FIRST and len(table.variables) > 1 and _takes_turns(variable.values):
+            _refuse_tags(table.path, [f"{x:g}" for x in dict.fromkeys(variable.values.tolist())])
         if re.fullmatch(_WHOSE, _plain(name)) and _takes_turns(variable.values):
             found[name] = [f"{name} {x:g}" for x in variable.values]
     return found
+
+
+def _refuse_tags(path: Path, tags: Sequence[str]) -> NoReturn:
+    """Refuse a table without names whose lines begin with the tags of several devices."""
+    raise UserError(
+        f"{path}: has lines that begin with {listed(tags, 4)} in turn, as of several devices, and no names; write a "
+        "line of names above them, as device,time,value, or give the lines of each device a file of its own"
+    )
 
 
 def _takes_turns(x: np.ndarray) -> bool:
@@ -116,7 +140,9 @@ def _takes_turns(x: np.ndarray) -> bool:
     period = len(np.unique(x))
     if not 1 < period <= _MAX_LABELS < len(x):
         return False
-    return bool(np.mean(x[1:] != x[:-1]) > _MIN_CHANGES and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC)
+    return bool(
+        np.mean(x[1:] != x[:-1]) > _MIN_CHANGES_OF_NUMBERS and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC
+    )
 
 
 def _in_seconds(clock: Variable) -> Variable:

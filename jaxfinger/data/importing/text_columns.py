@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxfinger.data.importing.dates import is_packed_date, month_first, packed_texts, past_midnight, seconds
 from jaxfinger.data.importing.dialect import ONE_GROUP, Dialect, has_points
-from jaxfinger.data.importing.text_lines import Line
+from jaxfinger.data.importing.text_lines import Line, refuse_others
 from jaxfinger.errors import UserError, counted, listed
 
 _LIST = re.compile(r"^(\[.*\]|\(.*\))$", re.DOTALL)
@@ -44,13 +44,14 @@ def read_columns(path: Path, body: Sequence[Line], dialect: Dialect, numeric: Se
                 return [Column(x) for x in table]
         except ValueError:
             pass
-    rows = []
-    for line in body:
-        rows.append(dialect.split(line.text) if quoted else line.text.split(separator))
-        if len(rows[-1]) != width:
-            raise UserError(
-                f"{path}: line {line.number} has {len(rows[-1])} cells, the others have {width}; correct or drop it"
-            )
+    rows = [dialect.split(line.text) if quoted else line.text.split(separator) for line in body]
+    others = [line for line, row in zip(body, rows, strict=True) if len(row) != width]
+    refuse_others(path, f"of {width} cells", others)
+    if others:
+        cells = len(dialect.split(others[0].text))
+        raise UserError(
+            f"{path}: line {others[0].number} has {cells} cells, the others have {width}; correct or drop it"
+        )
     # Where both marks stand for decimals in one file, or seem to, a number such as 1,234 is not clear.
     mixed = dialect.mark == "," and has_points(rows)
     if separator == dialect.mark == ",":  # Quoted cells such as "1,234" may also hold groups of digits.

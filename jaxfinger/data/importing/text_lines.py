@@ -11,9 +11,11 @@ from pathlib import Path
 
 from jaxfinger.data.importing.dates import seconds
 from jaxfinger.data.importing.dialect import SHEET_ERRORS
+from jaxfinger.errors import UserError
 
 _FEW = 60  # lines, which show how a file is written
 _MIN_SHARE = 0.8  # of them
+_MANY = 3  # lines of another kind: fewer may be cut or mixed up
 _STAMP = "time"  # name of the column of stamps beside labelled numbers
 _STAMPED = re.compile(r"\s*(?:\[([^\]]+)\]\s*(?:->)?|(\S+(?: \S+)?)\s*->)\s*(\S.*)")
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
@@ -23,6 +25,7 @@ _LABELLED = re.compile(  # a label, a number and perhaps its unit
     re.IGNORECASE,
 )
 COMMENTS = ("#", "%")
+MAX_QUOTED = 40  # characters of a line
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 
 
@@ -37,6 +40,9 @@ def read_lines(path: Path) -> list[Line]:
 
     A stamp that a serial monitor wrote before each line becomes the first cell, as that of `11:59:59.230 -> 1.5,20`.
     Where lines label their numbers, as `angle: 1.5, force: 20` or `angle=1.5 force=20`, the labels become names.
+
+    Raises:
+        UserError: many lines have other labels than most.
     """
     texts = enumerate(_lines(_decode(path.read_bytes())), 1)
     lines = [Line(number, text) for number, text in texts if text.strip()]
@@ -47,14 +53,33 @@ def read_lines(path: Path) -> list[Line]:
         lines = [replace(line, text=line.text if pair is None else mark.join(pair)) for line, pair in pairs]
         usual = _usual(lines)
     labels = Counter(tuple(_labelled(text)) for text in usual)
-    names, count = max(labels.items(), key=lambda item: item[1], default=((), 0))
-    if not names or count <= _MIN_SHARE * len(usual):
+    if not usual or len(usual) - labels.pop((), 0) <= _MIN_SHARE * len(usual):
+        return lines
+    names, count = labels.most_common(1)[0]
+    others = [line for line in lines if not set(_labelled(line.text)) <= set(names)]
+    refuse_others(path, f"labelled {', '.join(names)}", others)
+    if count <= _MIN_SHARE * len(usual):
         return lines
     rows = [Line(0, "\t".join(names))]
     for line in lines:
         found = _labelled(line.text)
         rows.append(replace(line, text="\t".join(found.values())) if tuple(found) == names else line)
     return rows
+
+
+def refuse_others(path: Path, usual: str, others: Sequence[Line]) -> None:
+    """Refuse a file with many lines of another kind than the `usual` ones, as of another device.
+
+    Raises:
+        UserError: they are too many to be faults of single lines.
+    """
+    if len(others) >= _MANY:
+        first = f"the first in line {others[0].number} ({others[0].text.strip()[:MAX_QUOTED]!r})"
+        raise UserError(
+            f"{path}: has {len(others)} lines among those {usual} that are of another kind, {first}, as where two "
+            "devices write into one file; give the lines of each device a file of its own (a column of a mapping may "
+            "name its `file` and `time`), or correct them if they are damaged"
+        )
 
 
 def _usual(lines: Sequence[Line]) -> list[str]:

@@ -28,7 +28,8 @@ def with_summed_steps(recording: Recording) -> Recording:
         if len(steps) < count or not is_time_step(name, steps):
             continue
         if lost := int(np.count_nonzero(~np.isfinite(steps[1:]))):
-            unusable[name + _SUM] = f"has no sum, since {counted(lost, 'step')} of time cannot be read; fill in what is missing"
+            said = f"has no sum, since {counted(lost, 'step')} of time cannot be read"
+            unusable[name + _SUM] = f"{said}; fill in what is missing"
         else:
             unit = variable.units or spelt(name)
             variables[name + _SUM] = replace(variable, values=np.cumsum(np.nan_to_num(steps)), units=unit)

@@ -81,6 +81,18 @@ def test_signals_one_after_another_that_share_their_times_share_a_clock(tmp_path
     np.testing.assert_array_equal(found["tau"].values, TORQUE)
 
 
+@pytest.mark.parametrize("often", [1, 8])
+@pytest.mark.parametrize("name", ["dev", "source", "board", "msg_type"])
+def test_lines_of_two_devices_are_told_apart_by_their_tag(tmp_path, name, often):
+    """Also where one has several lines for each of the other."""
+    table = []
+    for k, (t, a) in enumerate(zip(TIME, ANGLE, strict=True)):
+        table += [("A", t, a), *([("B", t + 0.002, 9.0)] if k % often == 0 else [])]
+    found = load_recording(csv(tmp_path / "log.csv", f"{name},t,angle", table)).variables
+    np.testing.assert_array_equal(found["A.angle"].values, ANGLE)
+    np.testing.assert_allclose(found[found["B.angle"].clock].values, TIME[::often] + 0.002)
+
+
 @pytest.mark.parametrize(("key", "labels"), [("joint", ("MCP", "PIP")), ("motor_id", (11, 12))])
 def test_a_row_a_sample_and_joint(tmp_path, key, labels):
     """No rate is invented from stamps that the joints share."""

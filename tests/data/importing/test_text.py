@@ -101,6 +101,38 @@ def test_a_line_with_a_number_and_another_width_is_no_prompt(tmp_path):
         load_recording(path)
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("A,{t:.2f},{a}", "B,{t:.2f},{f},{f}"),
+        ("{t:.2f},{a}", "{t:.2f},{f},{f}"),
+        ("A,{t:.2f},{a}", "B,{t:.2f},{f}"),
+        ("ENC {t:.2f} {a}", "LC {t:.2f} {f}"),
+        ("1,{t:.2f},{a}", "2,{t:.2f},{f}"),
+        ("$ENC,{t:.2f},{a}", "$LC,{t:.2f},{f},{f}"),
+        ("t={t:.2f} q={a}", "t={t:.2f} f={f} g={f}"),
+    ],
+)
+@pytest.mark.parametrize("often", [1, 5])
+def test_lines_of_two_devices_in_one_file_are_refused_with_the_mend(tmp_path, first, second, often):
+    """Neither device is dropped, and numbers of both are never in one column."""
+    if often > 1 and first.startswith("1"):
+        pytest.skip("numbers that seldom change are no tags")
+    path, rows = tmp_path / "log.txt", []
+    for k, (t, a) in enumerate(zip(TIME, ANGLE, strict=True)):
+        rows += [first.format(t=t, a=a), *([second.format(t=t, f=0.01 * k)] if k % often == 0 else [])]
+    path.write_text("\n".join([*rows, ""]))
+    with pytest.raises(UserError, match="of each device a file of its own"):
+        load_recording(path)
+
+
+def test_a_few_damaged_lines_are_no_second_device(tmp_path):
+    path = tmp_path / "log.txt"
+    rows = [f"t={t:.2f} q={a}" for t, a in zip(TIME, ANGLE, strict=True)]
+    path.write_text("\n".join([*rows[:50], "t=0.5 q=0.3 x=1", "t=0.5", "t=0.5", "t=0.5", *rows[50:], ""]))
+    assert len(load_recording(path).variables["q"].values) == len(rows)
+
+
 def test_brackets_before_a_name_are_a_part_of_it(tmp_path):
     found = written(tmp_path, "{t:.2f},{a}", "time,[ID:001] Present Position\n")
     assert columns_of(found)[1].meaning == "q"
