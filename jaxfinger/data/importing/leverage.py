@@ -14,10 +14,10 @@ from jaxtyping import Float
 
 from jaxfinger.data.importing.names import Owners
 from jaxfinger.data.importing.recording import Recording
-from jaxfinger.data.importing.survey import ColumnSurvey, agreed, columns_of, values_of, weight_on_reach
+from jaxfinger.data.importing.survey import GEARED, ColumnSurvey, agreed, columns_of, values_of, weight_on_reach
 from jaxfinger.data.importing.turning import by_speeds
 from jaxfinger.data.session import FingerDescription
-from jaxfinger.data.units import STANDARD_GRAVITY, TO_SI, spelt
+from jaxfinger.data.units import STANDARD_GRAVITY, TO_SI, spelt, spelt_unit
 
 # Range of a finger's largest moment arm, m, with room for a child's and for a large robot's. Where the arms are known,
 # as shares of the largest: routed tendons lose up to two thirds of their tension on the way to the joint.
@@ -50,7 +50,9 @@ def surveyed(recordings: Sequence[Recording], finger: FingerDescription | None) 
     names = (finger.joint_names, finger.tendon_names) if finger is not None else ()
     weight = weight_on_reach(finger)
     seen = [by_speeds(r, columns_of(r, recordings, *names, weight=weight)) for r in recordings]
-    return by_arms(recordings, _agreed(recordings, seen, Owners(*names or ((), ())), weight), finger)
+    seen = _agreed(recordings, seen, Owners(*names or ((), ())), weight)
+    seen = [_angles(r, columns, finger) for r, columns in zip(recordings, seen, strict=True)]
+    return by_arms(recordings, seen, finger)
 
 
 def _agreed(
@@ -90,6 +92,25 @@ def by_arms(
         told = {s: replace(s, units=unit if s.high - s.low >= least else "") for s in open_}
         surveys = [[told.get(s, s) for s in columns] for columns in surveys]
     return surveys
+
+
+def _angles(recording: Recording, seen: Sequence[ColumnSurvey], finger: FingerDescription | None) -> list[ColumnSurvey]:
+    """Surveys of a recording whose angles, taken for rad by their size, are left open where moment arms contradict it.
+
+    The arms are those that travels in a known unit show. Angles of a motor before its gear make other ones.
+    """
+    guessed = [s for s in seen if s.units == "rad" and _is_open(s, "q")]
+    travels = [s for s in seen if s.meaning == "tendon_excursion" and (s.stated or spelt_unit(s.name)) and s.units]
+    turns = [q for s in guessed if _span(q := values_of(recording, s)) > _MIN_TURN]
+    lengths = [values_of(recording, s) * TO_SI[s.units].factor for s in travels]
+    slopes = [_largest_slope(x, [q for q in turns if len(q) == len(x)]) for x in lengths]
+    arm, (low, high) = max(slopes, default=0.0), _arms(finger, "tendon_excursion")
+    if not arm or low < arm < high:
+        return list(seen)
+    doubt = (
+        f"in rad it would make a moment arm of {1e3 * arm:.3g} mm, not {1e3 * low:.3g} to {1e3 * high:.3g}: {GEARED}"
+    )
+    return [replace(s, units="", doubt=doubt) if s in guessed else s for s in seen]
 
 
 def _arms(finger: FingerDescription | None, channel: str) -> tuple[float, float]:

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from jaxfinger.data.importing.logs import Log
-from jaxfinger.data.importing.names import is_before_a_gear, is_position, is_speed, words
+from jaxfinger.data.importing.names import is_speed, words
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, values_of
+from jaxfinger.data.importing.survey import GEARED, ColumnSurvey, values_of
 from jaxfinger.data.signals.pace import speed
 from jaxfinger.data.toml import quoted
 from jaxfinger.data.units import EITHER, MAX_OVERTRAVEL, TO_SI, near_limits, spelt_unit
@@ -47,6 +47,7 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
     guessed = seen.meaning == "q" and turns and not seen.stated
     if seen.units and TO_SI[seen.units].si == fits.get(seen.meaning) and not guessed:
         parts.append(f'units = "{seen.units}"')
+        doubts += [seen.doubt] if seen.doubt else []
     else:
         parts.append('units = "?"')
         doubts.append(_doubt(seen))
@@ -80,9 +81,7 @@ def _doubt(seen: ColumnSurvey) -> str:
         return f"it states {seen.foreign}: {EITHER.get(seen.foreign.lower(), 'write `scale` too, or another unit')}"
     if seen.whole:
         return "whole numbers, as counts are: then write `scale` too"
-    if seen.meaning == "q" and (is_before_a_gear(seen.name) or is_position(seen.name)):
-        return "it may be in rad, in degrees or, as drives count, in turns; of a motor before a gear write `scale` too"
-    return "its size does not tell"
+    return seen.doubt or "its size does not tell"
 
 
 def torque_line(columns: Sequence[ColumnSurvey], weight: float) -> list[str]:
@@ -121,7 +120,7 @@ def within(seen: ColumnSurvey, limits: np.ndarray | None) -> ColumnSurvey:
     if seen.meaning != "q" or seen.units != "rad" or limits is None or not _is_guessed(seen):
         return seen
     farther = float(np.ptp(limits)) + 2.0 * MAX_OVERTRAVEL < seen.high - seen.low < _MOST_OF_A_TURN
-    return replace(seen, units="") if farther else seen
+    return replace(seen, units="", doubt=f"it goes farther than the limits: {GEARED}") if farther else seen
 
 
 def _is_guessed(seen: ColumnSurvey) -> bool:

@@ -38,7 +38,7 @@ _TIME_STEP += r"|(time|sample|sampling)_?(interval|period)"
 # Name of a column of a table without names, or one that says no more: programs that draw curves call times x.
 _NAMELESS = r"column \d+|x([ _-]?(value|axis)s?)?"
 # Names of velocities, which belong to no channel, of set-points, which are not measured, and of switches and states.
-_VELOCITY = r"(?<![a-z])q?(vel|acc)|speed|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
+_VELOCITY = r"(?<![a-z])q?(vel|acc)|speed|(?<![a-z])rpm|dot|^v$|^dq|(^|_)(d+(q|theta)|(q|theta)d+)(_|\d|$)"
 _STATE = r"enable|flag|status|valid|(^|_)(on|off|ok|mode|err|error|fault|alarm)(_|\d|$)|collision|joint_contact"
 _SET_POINT = (
     r"cmd|command|cmptd|computed|ref(?!l)|desired|set_?p(oin)?t|goal|target|demand|soll|feed_?forward"
@@ -47,6 +47,7 @@ _SET_POINT = (
 )
 # Names of what is in front of a joint's gear or spring, and of positions as drives and encoders count them.
 MOTOR = r"(?<![a-z])(motor|mot|drive|actuator|rotor|spool|winch)(?![a-z])"
+_ELECTRIC = r"(?<![a-z])(current|curr|strom|i_?q|pwm|duty(_?cycle)?|rpm|v_?bus|bus_?voltage)(?![a-z])"
 _OF_DRIVE = r"pos_?(estimate|cpr|circular)|odrv|odrive|moteus"
 _POSITION = r"(?<![a-z])(pos(ition)?|enc(oder)?)(?![a-z])"
 _SI_UNITS = {
@@ -95,6 +96,11 @@ def is_nameless(name: str) -> bool:
 def is_before_a_gear(name: str) -> bool:
     """Whether a column is of a motor by its name, so that a gear may be between it and the joint."""
     return re.search(f"{MOTOR}|{_OF_DRIVE}", words(name)) is not None
+
+
+def is_electric(name: str) -> bool:
+    """Whether a column is of a drive by its name: its current, duty cycle or voltage, or the speed of its motor."""
+    return re.search(_ELECTRIC, words(name)) is not None
 
 
 def is_position(name: str) -> bool:

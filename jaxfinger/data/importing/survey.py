@@ -13,6 +13,7 @@ from jaxfinger.data.importing.names import (
     Owners,
     as_word,
     is_before_a_gear,
+    is_electric,
     is_joint,
     is_nameless,
     is_position,
@@ -46,6 +47,7 @@ _MAX_VALUES = {
 # Angles that are never larger may be turns, in which some motor drives count: no joint of a finger turns by more than
 # 110°. In rad they would be 17° at most, which is little for a recording.
 _MAX_TURNS = 0.3
+GEARED = "it may be in rad, in degrees or, as drives count, in turns; of a motor before a gear write `scale` too"
 # Of the torque with which the whole finger weighs on an arm as long as its reach: torques up to the first are in N m,
 # since in N cm or N mm they would be a few hundredths of it, less than any load moves them. Larger ones than the second
 # are in N mm: in N cm they would be twenty times it. Between them the unit stays open.
@@ -70,6 +72,9 @@ class ColumnSurvey:
     meaning: str  # channel, `time`, or empty
     foreign: str = ""  # unit that the recording states and no mapping converts, such as counts
     whole: bool = False  # whether its values are whole numbers, as counts are
+    doubt: str = (
+        ""  # why its unit is open, or may be another, where there is more to say than that its size does not tell
+    )
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,7 @@ def columns_of(
     """
     owners = Owners(joints, tendons)
     said = _said(recording, owners)
+    beside = _beside(recording, said)
     found, guessed = [], {}
     for name, variable in recording.variables.items():
         table = variable.values.reshape(len(variable.values), -1)
@@ -125,16 +131,19 @@ def columns_of(
             finite = x[np.isfinite(x)]
             whole = len(finite) > 0 and bool(np.all(finite == np.round(finite)) and np.ptp(finite) > 0.0)
             counts = whole and meaning in _MAX_VALUES and meaning != "temperature"
+            doubt = ""
             if not (units or foreign or counts):
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
-                if meaning == "q" and finite.any() and _may_be_geared(name, variable, units, owners):
-                    units = ""
+                if meaning == "q" and finite.any():
+                    units, doubt = _angle(name, variable, units, owners, beside)
                 if meaning in _MAX_VALUES and np.isfinite(sizes).any():
                     guessed[len(found)] = np.nanmax(sizes)
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
             missing = len(x) - len(finite)
-            found.append(ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign, whole))
+            found.append(
+                ColumnSurvey(name, column, len(x), low, high, missing, units, stated, meaning, foreign, whole, doubt)
+            )
     found = _without_turns(agreed(found, guessed, owners, weight), guessed)
     if not any(s.meaning == "time" for s in found):
         for k, s in enumerate(found):
@@ -145,13 +154,29 @@ def columns_of(
     return found
 
 
-def _may_be_geared(name: str, variable: Variable, units: str, owners: Owners) -> bool:
-    """Whether angles without a stated unit may be of a motor before its gear, in any unit, or counted in turns.
+def _angle(name: str, variable: Variable, units: str, owners: Owners, beside: Mapping[str, str]) -> tuple[str, str]:
+    """Unit of an angle that states none, given one by its size, and why it may be another.
 
-    Positions of a joint, as those of a JointState, are in rad.
+    It is open for what is a motor's by its name, or a position and no joint's, and beside a column of a `motor` that
+    has no other angle: these may be before a gear, or in turns. Beside that of a `drive` it is only said. Positions of
+    a joint, as those of a JointState, are in rad.
     """
-    of_joint = variable.columns or owners.of(words(name))[0]
-    return is_before_a_gear(name) or (units == "rad" and is_position(name) and not of_joint)
+    of_joint = variable.columns or owners.of(words(name))[0] or "joint" in name.lower()
+    if is_before_a_gear(name) or (units == "rad" and is_position(name) and not of_joint):
+        return "", GEARED
+    if units != "rad" or of_joint or not beside:
+        return units, ""
+    if motor := beside.get("motor"):
+        return "", f"{motor} is of a motor, and so may this be: {GEARED}"
+    return units, f"if the joint's; if of the drive with {beside['drive']}, it may be in turns before a gear"
+
+
+def _beside(recording: Recording, said: Mapping[tuple[str, int], tuple[str, str]]) -> dict[str, str]:
+    """Names of a column that is of a `motor`, and of one of a `drive`; none where the motor's angle is there too."""
+    named = {"motor": is_before_a_gear, "drive": is_electric}
+    found = {what: next((name for name in recording.variables if of(name)), "") for what, of in named.items()}
+    has_angle = any(is_before_a_gear(name) and meaning == "q" for (name, _), (meaning, _) in said.items())
+    return {} if has_angle else {what: name for what, name in found.items() if name}
 
 
 def _is_no_unit(stated: str, owners: Owners) -> bool:

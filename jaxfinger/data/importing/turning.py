@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxfinger.data.importing.names import is_speed
+from jaxfinger.data.importing.names import is_before_a_gear, is_speed
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.speeds import speeds
-from jaxfinger.data.importing.survey import ColumnSurvey, values_of
+from jaxfinger.data.importing.survey import GEARED, ColumnSurvey, values_of
 from jaxfinger.data.units import TO_SI, spelt, unit_name
 
 _ANGLES = {name: TO_SI[name].factor for name in ("rad", "deg", "turn")}
@@ -23,7 +23,8 @@ def by_speeds(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[Column
     """Survey of a log's columns, with the units of angles, where these state none, that their speeds tell.
 
     Turns stay open, since a drive that counts them is often in front of a gear, and so do angles that fit no unit of
-    their stated speed. Of a speed that is the change of its angle in that one's own units nothing is learnt.
+    their stated speed, or whose speed is a motor's. Of a speed that is the change of its angle in that one's own units
+    nothing is learnt.
     """
     rate = _rate(recording, seen)
     open_ = {i for i, s in enumerate(seen) if s.meaning == "q" and not (s.stated or s.foreign or s.whole)}
@@ -41,7 +42,9 @@ def by_speeds(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[Column
         ratios = {name: [there / rate * factor / x for factor in among.values()] for name, x in _ANGLES.items()}
         fitting = [name for name, of_units in ratios.items() if any(abs(r - 1.0) < _MAX_ERROR for r in of_units)]
         if len(fitting) == 1 or unit:
-            told[at] = replace(seen[at], units="" if fitting in ([], ["turn"]) else fitting[0])
+            tells = len(fitting) == 1 and fitting != ["turn"] and not is_before_a_gear(by.name)
+            doubt = "" if tells else f"{by.name} tells turns or a gear: {GEARED}"
+            told[at] = replace(seen[at], units=fitting[0] if tells else "", doubt=doubt)
     return told
 
 

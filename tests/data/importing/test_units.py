@@ -188,6 +188,41 @@ def test_a_speed_tells_the_unit_of_its_angle(tmp_path, angle, speed, name, units
     assert f'units = "{units}"' in line(path, "q")
 
 
+@pytest.mark.parametrize(
+    ("name", "beside", "values", "units", "doubt"),
+    [
+        ("q", "motor_current", np.cos(TIME), "?", "motor_current is of a motor, and so may this be"),
+        ("angle", "drive_temperature", TIME, "?", "drive_temperature is of a motor, and so may this be"),
+        ("angle", "current_A", np.cos(TIME), "rad", "if of the drive with current_A, it may be in turns before a gear"),
+        ("joint_angle", "motor_current", np.cos(TIME), "rad", ""),
+        ("angle_MCP", "motor_current", np.cos(TIME), "rad", ""),
+        ("angle", "motor_angle [deg]", 500 * np.cos(TIME), "rad", ""),
+        ("angle", "tau [N m]", 0.1 * np.cos(TIME), "rad", ""),
+        ("angle", "motor_speed [rad/s]", 0.4 * np.cos(TIME), "?", "motor_speed [rad/s] tells turns or a gear"),
+        ("angle", "rpm", 24.0 * np.cos(TIME), "?", "rpm tells turns or a gear"),
+    ],
+)
+def test_an_angle_beside_a_motor_that_has_no_other_may_be_the_motors(tmp_path, name, beside, values, units, doubt):
+    """An angle that is called a joint's is the joint's, and so is one beside that of the motor."""
+    said = line(log(tmp_path, f"time [s],{name},{beside}", SWEEP, values), "q")
+    assert f'from = "{name}", units = "{units}" }}' in said
+    assert doubt in said if doubt else "#" not in said
+
+
+def test_a_speed_tells_that_an_angle_beside_a_motor_is_the_joints(tmp_path):
+    path = log(tmp_path, "time [s],q,dq [rad/s],motor_current", SWEEP, 0.4 * np.cos(TIME), np.cos(TIME))
+    assert line(path, "q") == 'channels.q.J1 = { from = "q", units = "rad" }'
+
+
+@pytest.mark.parametrize(("turns", "units"), [(1.0, "rad"), (2.5, "?"), (0.4, "?")])
+def test_known_moment_arms_tell_an_angle_before_a_gear(tmp_path, turns, units):
+    finger = replace(make_finger(), excursion=np.full((3, 2, 1), 0.008), excursion_std=None)
+    path = log(tmp_path, "time [s],q_MCP,excursion_T1 [mm]", 1.5 * turns * SWEEP, 8.0 * 1.5 * SWEEP)
+    said = next(s for s in proposal([load_recording(path)], finger).splitlines() if "channels.q" in s)
+    assert f'units = "{units}"' in said
+    assert ("in rad it would make a moment arm of" in said) == (units == "?")
+
+
 def test_a_speed_through_a_gear_opens_the_unit_that_a_size_told(tmp_path):
     path = log(tmp_path, "time [s],q,dq [rad/s]", SWEEP / 2.0, 0.4 * np.cos(TIME))
     assert 'units = "?"' in line(path, "q")
