@@ -69,9 +69,9 @@ def _still(values: Float[np.ndarray, "N columns"] | None, columns: int) -> Bool[
 
 
 def _constant(trial: Trial, session: Session) -> dict[str, Bool[np.ndarray, " columns"]]:
-    """`constant_columns`, without the torque of VD.3, which is zero: nothing but tendons drives the finger."""
+    """`constant_columns`, but for angles, and for the torque of VD.3, which is zero: tendons alone drive the finger."""
     found = constant_columns(trial, session.finger)
-    return {c: still for c, still in found.items() if (trial.experiment, c) != ("VD.3", "joint_torque")}
+    return {c: x for c, x in found.items() if c != "q" and (trial.experiment, c) != ("VD.3", "joint_torque")}
 
 
 def name_constant(reads: Mapping[str, Collection[str]], session: Session) -> list[str]:

@@ -14,6 +14,7 @@ from jaxfinger.data.checks.delay import check_delay
 from jaxfinger.data.checks.finger import check_finger
 from jaxfinger.data.checks.gravity import check_gravity, check_torque_scales
 from jaxfinger.data.checks.held import check_held
+from jaxfinger.data.checks.paths import check_paths
 from jaxfinger.data.checks.pulls import check_pulls
 from jaxfinger.data.checks.trial import check_trial
 from jaxfinger.data.checks.values import MAX_TARE_ERROR
@@ -138,6 +139,7 @@ def check_samples(session: Session, report: Report) -> None:
         if report.fatal is None:
             check_work(session, report)
             check_columns(session, report)
+            check_paths(session, report)
             check_copied_columns(session, report)
             check_gravity(session, report)
             check_torque_scales(session, report)

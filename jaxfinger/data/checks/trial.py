@@ -189,7 +189,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
     moved = finger.joint(trial.joint) if trial.experiment in _MOVES_JOINT else None
     if moved is not None and spans[moved] < still[moved]:
         message = f"joint {trial.joint} never moves (it spans {spans[moved]:.2g}), though {trial.experiment} moves it"
-        say(place, f"{message}; correct the attribute `joint`, or record the trial again")
+        say(place, f"{message}; check its column, correct the attribute `joint`, or record the trial again")
     elif (
         trial.experiment in ("VD.1", "VD.3") or (trial.joint is None and trial.experiment in _MOVES_JOINT)
     ) and np.all(spans < still):
@@ -206,7 +206,7 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
             place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
         )
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < sizes.travel:
-        message = f"tendon {trial.tendon} is never pulled; check the attribute `tendon`"
+        message = f"tendon {trial.tendon} is never pulled; check its column, and the attribute `tendon`"
         report.warning(trial.place("tendon_force"), message)
     elif trial.experiment in NEEDS_TENDON and not pulled_slowly(trial, _pulled(trial, finger), sizes):
         shortest = (MIN_HOLD + 2.0 / HOLD_CUTOFF_HZ) * sizes.slow_pace  # with both ends, which the filter blurs

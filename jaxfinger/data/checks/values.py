@@ -10,7 +10,7 @@ import numpy as np
 from jaxfinger.data.checks.jumps import check_jumps
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mounting import reach_of, weight_of
-from jaxfinger.data.schema import CHANNELS, measured_columns
+from jaxfinger.data.schema import CHANNELS, DRIVES, measured_columns
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.motion import MIN_MOTION
 from jaxfinger.data.signals.quantiles import median, quantile
@@ -66,10 +66,12 @@ def _constant_columns(trial: Trial, finger: FingerDescription, report: Report) -
             of_value[getattr(trial, channel)[0, k] + 0.0].append(names[k])  # −0 becomes 0.
         for value, alike in of_value.items():
             columns, are, them = ("column", "is", "it") if len(alike) == 1 else ("columns", "are", "them")
+            needed = channel in ("q", *DRIVES.get(trial.experiment, ()))
+            mend = "record the trial again" if needed else f"leave {them} out"
             report.warning(
                 trial.place(channel),
                 f"{columns} {listed(alike)} {are} {value:.4g} at every sample, as no sensor is; check cable and "
-                f"column, or leave {them} out",
+                f"column, or {mend}",
             )
 
 

@@ -37,12 +37,12 @@ def measured_arms(session: Session) -> dict[int, Arms]:
         i = int(np.argmax(np.nan_to_num(spans)))
         if trial.tendon_excursion is not None and np.all(np.delete(spans, i) < STILL_ANGLE) and spans[i] > STILL_ANGLE:
             q = thinned(trial.q[:, i])
-            columns = [thinned(l) for l in trial.tendon_excursion.T] + list(_known(session.finger, i, q))
+            columns = [thinned(l) for l in trial.tendon_excursion.T] + list(known_excursions(session.finger, i, q))
             found[i].append(np.reshape([slope(q, l) for l in columns], (2, -1)))
     return {i: Arms(*np.median(arms, axis=0)) for i, arms in found.items()}
 
 
-def _known(finger: FingerDescription, i: int, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, "n N"]:
+def known_excursions(finger: FingerDescription, i: int, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, "n N"]:
     """Excursions at joint i by the finger's file, m; NaN where they are unknown."""
     if finger.excursion is None:
         return np.full((finger.n, len(q)), np.nan)
