@@ -200,7 +200,17 @@ COMMAND = r"(?:jaxfinger|python|source|apt-get|\.venv/\S+) "  # other tests run 
 # Words in backticks that are no names of ours: a reader's, those of other programs and of another laboratory's files.
 OTHERS = {"OUT", "TRUTH", "PORT", "NNN", "month", "prox", "m1", "u_c", "stamp_ms", "joint_states", "lint"}
 OTHERS |= {"BSpline", "next_fast_len", "wiener", "qm", "qg", "kp", "vir", "gtau", "pulses_N"}
-OTHERS |= {"angle_MCP", "force_T1", "motor_id", "torque_N_mm", "force_kg", "candump"}
+OTHERS |= {
+    "angle_MCP",
+    "force_T1",
+    "motor_id",
+    "torque_N_mm",
+    "force_kg",
+    "candump",
+    "motor_current",
+    "delta_t",
+    "time_step",
+}
 WRITTEN = {"drag.py", "mine.py", "commands.md", "causes.md", "table.md", "scores/table.md"}  # by a reader or a command
 
 

@@ -8,15 +8,18 @@ angles of two joints are exchanged, these are.
 from __future__ import annotations
 
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxfinger.data.findings import Report
 from jaxfinger.data.session import FingerDescription, Session, Trial
 from jaxfinger.data.signals.arms import Excursions, known_excursions, thinned
 from jaxfinger.data.signals.motion import STILL_ANGLE
 from jaxfinger.errors import listed
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 _DEGREE = 3  # of l(q) by joint, as in `signals.arms`
 _MIN_PATH = 0.01  # of the finger's length, of excursion: over less, stretch and noise may be all that there is.
