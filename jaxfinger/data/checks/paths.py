@@ -36,13 +36,20 @@ def check_paths(session: Session, report: Report) -> None:
         return
     kinematic = Excursions(session)
     for trial in session.select("VD.1"):
-        if trial.tendon_excursion is not None and np.isfinite(trial.q).all() and len(trial.time) >= _MIN_SAMPLES:
-            _path(trial, session.finger, kinematic, report)
+        l = trial.tendon_excursion
+        if l is not None and np.isfinite(trial.q).all() and len(l) >= _MIN_SAMPLES:
+            _path(trial, thinned(trial.q), thinned(l), session.finger, kinematic, report)
 
 
-def _path(trial: Trial, finger: FingerDescription, kinematic: Excursions, report: Report) -> None:
-    """Report one free path."""
-    q, l = thinned(trial.q), thinned(trial.tendon_excursion)
+def _path(
+    trial: Trial,
+    q: Float[np.ndarray, "N m"],
+    l: Float[np.ndarray, "N n"],
+    finger: FingerDescription,
+    kinematic: Excursions,
+    report: Report,
+) -> None:
+    """Report one free path, of angles `q` and excursions `l`."""
     least = _MIN_PATH * finger.length
     tendons = [k for k in np.flatnonzero(finger.active & finger.crosses.any(axis=1)) if np.ptp(l[:, k]) > least]
     left = np.array([_left(l[:, k], q, int(k), finger, kinematic) for k in tendons])
@@ -81,7 +88,8 @@ def _left(
     """
     joints = [int(i) for i in np.flatnonzero(finger.crosses[tendon])]
     if all((tendon, i) in by.polynomials for i in joints):
-        parts = [by.polynomials[tendon, i](np.clip(q[:, i], *by.polynomials[tendon, i].domain)) for i in joints]
+        laws = [by.polynomials[tendon, i] for i in joints]
+        parts = [law(q[:, i].clip(law.domain[0], law.domain[1])) for law, i in zip(laws, joints, strict=True)]
         X = np.sum(parts, axis=0)[:, None]
     else:
         known = np.sum([known_excursions(finger, i, q[:, i])[tendon] for i in joints], axis=0)

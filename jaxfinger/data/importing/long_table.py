@@ -36,8 +36,8 @@ _VALUE = r"(value|val|data|reading|wert|messwert|valeur)s?"
 _UNIT = r"units?|einheit"
 _MAX_LABELS = 100  # different signals; more are no names
 # Of the rows: rows of several joints alternate, also where one has ten for each of another, and phases of an experiment
-# do not. Numbers may change with a motion.
-_MIN_CHANGES, _MIN_CHANGES_OF_NUMBERS = 0.1, 0.5
+# do not.
+_MIN_CHANGES = 0.1
 _FIRST = "column 0"  # name of the first column of a table without names
 _MIN_PERIODIC = 0.8  # of the rows: numbers of joints return in turn, other whole numbers do not.
 
@@ -114,8 +114,9 @@ def _keys(table: Recording, valued: bool) -> dict[str, list[str]]:
         alternates = np.mean(cells[1:] != cells[:-1]) > _MIN_CHANGES
         if several and alternates and name == _FIRST:
             _refuse_tags(table.path, list(dict.fromkeys(cells.tolist())))
-        whose = bool(re.fullmatch(_WHOSE, _plain(name))) and alternates
-        if several and (whose or (valued and re.fullmatch(_SIGNAL, _plain(name)))):
+        whose = re.fullmatch(_WHOSE, _plain(name)) if alternates else None
+        in_turn = several and _takes_turns(np.unique(cells, return_inverse=True)[1])
+        if several and (whose or in_turn or (valued and re.fullmatch(_SIGNAL, _plain(name)))):
             found[name] = cells.tolist()
     for name, variable in table.variables.items():
         if name == _FIRST and len(table.variables) > 1 and _takes_turns(variable.values):
@@ -137,12 +138,13 @@ def _takes_turns(x: np.ndarray) -> bool:
     """Whether a column holds a few whole numbers that return in turn, as those of joints do."""
     if x.ndim > 1 or not np.all(x == np.round(x)):
         return False
-    period = len(np.unique(x))
-    if not 1 < period <= _MAX_LABELS < len(x):
+    labels, counts = np.unique(x, return_counts=True)
+    if not 1 < len(labels) <= _MAX_LABELS < len(x):
         return False
-    return bool(
-        np.mean(x[1:] != x[:-1]) > _MIN_CHANGES_OF_NUMBERS and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC
-    )
+    comes = np.flatnonzero(np.diff((x == labels[np.argmin(counts)]).astype(int)) > 0)  # of the one that is there least
+    period = int(np.median(np.diff(comes))) if len(comes) > 1 else 0
+    changes = np.mean(x[1:] != x[:-1]) > _MIN_CHANGES
+    return bool(len(labels) <= period < len(x) and changes and np.mean(x[period:] == x[:-period]) > _MIN_PERIODIC)
 
 
 def _in_seconds(clock: Variable) -> Variable:

@@ -82,15 +82,30 @@ def test_signals_one_after_another_that_share_their_times_share_a_clock(tmp_path
 
 
 @pytest.mark.parametrize("often", [1, 8])
-@pytest.mark.parametrize("name", ["dev", "source", "board", "msg_type"])
+@pytest.mark.parametrize("name", ["dev", "source", "board", "msg_type", "whence"])
 def test_lines_of_two_devices_are_told_apart_by_their_tag(tmp_path, name, often):
-    """Also where one has several lines for each of the other."""
+    """Also where one has several lines for each of the other, and whatever the column is called if it is regular."""
     table = []
     for k, (t, a) in enumerate(zip(TIME, ANGLE, strict=True)):
         table += [("A", t, a), *([("B", t + 0.002, 9.0)] if k % often == 0 else [])]
     found = load_recording(csv(tmp_path / "log.csv", f"{name},t,angle", table)).variables
     np.testing.assert_array_equal(found["A.angle"].values, ANGLE)
     np.testing.assert_allclose(found[found["B.angle"].clock].values, TIME[::often] + 0.002)
+
+
+def test_numbers_of_devices_of_which_one_is_slower_are_told_apart(tmp_path):
+    table = [(k % 6 == 0, t, a) for k, (t, a) in enumerate(zip(TIME, ANGLE, strict=True))]
+    found = load_recording(csv(tmp_path / "log.csv", "node,t,angle", [(int(n), t, a) for n, t, a in table])).variables
+    np.testing.assert_array_equal(found["node 1.angle"].values, ANGLE[::6])
+
+
+def test_words_that_tell_phases_or_states_apart_are_no_devices(tmp_path):
+    rng = np.random.default_rng(0)
+    states = np.where(rng.random(len(TIME)) < 0.2, "late", "ok")
+    phases = np.repeat(["up", "hold", "down", "hold"], len(TIME) // 4)
+    for words in (states, phases):
+        path = csv(tmp_path / "log.csv", "t,state,angle", list(zip(TIME, words, ANGLE, strict=True)))
+        assert len(load_recording(path).variables["angle"].values) == len(TIME)
 
 
 @pytest.mark.parametrize(("key", "labels"), [("joint", ("MCP", "PIP")), ("motor_id", (11, 12))])
