@@ -72,9 +72,7 @@ class ColumnSurvey:
     meaning: str  # channel, `time`, or empty
     foreign: str = ""  # unit that the recording states and no mapping converts, such as counts
     whole: bool = False  # whether its values are whole numbers, as counts are
-    doubt: str = (
-        ""  # why its unit is open, or may be another, where there is more to say than that its size does not tell
-    )
+    doubt: str = ""  # why its unit is open, or may be another, if there is more to say than that its size does not tell
 
 
 @dataclass(frozen=True)
