@@ -80,6 +80,7 @@ class Course:
         self.place: tuple[str, int, int] = ("", 0, 0)
         self._was_on = False  # whether a sample has shown the drives on since they were switched on
         self.drives_off = False
+        self._since = time.monotonic()  # the last Enter, or when the drives were last switched on
 
     @property
     def drives_on(self) -> bool:
@@ -88,13 +89,24 @@ class Course:
 
     def drives_go_on(self) -> None:
         """Take note that the drives are about to be switched on. The watch guards from now on."""
-        self.drives_off = False
+        self.drives_off, self._since = False, time.monotonic()
         self.watch.guard()
 
     def drives_are_off(self) -> None:
         """Take note that the drives were seen off."""
         self.watch.guards = self._was_on = False
         self.drives_off = True
+
+    def answered(self) -> None:
+        """Take note that a prompt has just been answered."""
+        self._since = time.monotonic()
+
+    def suspended_s(self) -> float:
+        """Time in s for which the program was suspended since the last Enter and since the drives were switched on.
+
+        With the drives on it ends the run. With them off, whoever pressed Enter before does not expect them to go on.
+        """
+        return self.watch.suspended_s(self._since)
 
     def show(self, doing: str, block: Block | None) -> None:
         """Hand the state of the run to the live view."""

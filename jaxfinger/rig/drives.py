@@ -127,6 +127,8 @@ class Drives:
             return reader.latest_seq >= head and reader.quiet(round(QUIET_S * rig.rate_hz))
 
         self.course.let_pass(QUIET_TIMEOUT_S, lambda: quiet() or reader.violation is not None)
+        if away := self.course.suspended_s():
+            raise UserError(f"nothing was armed: the program was suspended for {away:.1f} s (Ctrl-Z) meanwhile.")
         self.course.check(reader.latest)
         if not quiet():
             bad = reader.unarmed_violation
@@ -235,4 +237,5 @@ class Drives:
         # Also where Enter came just then: who answers a prompt that is over does not expect a motor to move.
         if late():
             raise TrialEnded(f"nobody answered the prompt within {patience:g} s (prompt_s of [rig])", Trip.HOST)
+        self.course.answered()
         return not (lasting or (off and self._pulled()))

@@ -88,8 +88,9 @@ class Reader:
         patience = self.rig.description.deadlines.stale_s
         if self.rig.simulated_time:
             return self.rig.read_block(patience)
+        late = time.monotonic() - news > patience  # Before the poll: a thread that was held up polls once more.
         block = self.rig.poll()
-        if block is None and time.monotonic() - news > patience:
+        if block is None and late:
             raise StaleRig(stale(patience))
         return block
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 
 import numpy as np
@@ -92,7 +93,7 @@ class Runner:
         tension, the operator is to switch the drives off.
         """
         self.course.watch.interrupts.stopping = True
-        reader = self.reader
+        reader, away = self.reader, self.course.suspended_s() if self.course.drives_on else 0.0
         trip, seq = (error.trip, error.seq) if isinstance(error, TrialEnded) else (Trip.HOST, None)
         said = str(error) if isinstance(error, UserError) else f"the recorder failed ({type(error).__name__}: {error})"
         cause = said.rstrip(".")
@@ -105,6 +106,8 @@ class Runner:
         self.course.let_pass(RELEASE_S, self.drives.released)
         if self.drives.released() or reader.latest_seq > heard:  # Of a silent reader nothing more is to be expected.
             self.course.let_pass(RELEASE_S)
+        if away:  # What was found when the program went on only follows from it.
+            trip, cause = self._stopped_meanwhile(trip, away)
         end = {"complete": False, "cause": cause, "trip": int(trip), "seq": seq}
         if reader.recording:
             reader.end(end)
@@ -115,6 +118,19 @@ class Runner:
         if reader.latest is None:
             return cause
         return f"{cause}; {RELEASED if self.drives.released() else TENSION_NOT_SEEN_TO_FALL}"
+
+    def _stopped_meanwhile(self, trip: Trip, away: float) -> tuple[Trip, str]:
+        """Trip code and cause where the program was suspended for `away` s with the drives on.
+
+        `trip` is what the host found afterwards. The controller knows what stopped the drives.
+        """
+        stopped = "without a heartbeat the controller's watchdog stops them by itself"
+        with suppress(Exception):  # Of any kind: a controller that does not answer must not cut off the end.
+            if self.reader.reads and 0 < (status := self.rig.status()).trip <= Trip.HEARTBEAT:
+                trip, stopped = status.trip, f"meanwhile the controller stopped them: {status.cause}"
+        if trip is Trip.HEARTBEAT:
+            stopped = "the controller's watchdog stopped them, since it got no heartbeat"
+        return trip, f"the program was suspended for {away:.1f} s (Ctrl-Z) with the drives on; {stopped}"
 
     def carry_out(self, protocol: Protocol, place: tuple[str, int, int]) -> None:
         """Carry out the steps of a protocol; `place` is the trial's name, its number and the count of trials.

@@ -51,6 +51,7 @@ class Watch:
         self._seen: dict[int, int] = {}  # signs at the last check
         self._silent: dict[int, float] = {}  # s without a new sign
         self._checked = self._beaten = time.monotonic()  # when it last checked, and last allowed a heartbeat
+        self._pauses: list[tuple[float, float]] = []  # when it stood still for longer than `heartbeat_s` (s, monotonic)
         self.guards = False
         self._allowed = threading.Event()  # one heartbeat
         self._closing = threading.Event()
@@ -107,6 +108,8 @@ class Watch:
     def check(self) -> None:
         """Check stop key, signals, threads, disk: stop the rig where one fails, else allow a heartbeat if it is due."""
         now = time.monotonic()
+        if now - self._checked > self.rig.description.loosest_limits.heartbeat_s:
+            self._pauses.append((self._checked, now))
         passed, self._checked = min(now - self._checked, MAX_COUNTED_S), now
         if self.reader.violation is not None or self.reader.error is not None:
             return  # The rig is being stopped, or nothing reads it: no heartbeat.
@@ -123,6 +126,19 @@ class Watch:
         if self.operator.stop_requested():
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, Trip.OPERATOR.sentence)
         return None
+
+    def suspended_s(self, since: float) -> float:
+        """Time in s for which the program was suspended, as by Ctrl-Z, after `since` (s, monotonic); 0 where it was not.
+
+        Only what is longer than `heartbeat_s` counts: after that the controller has released the finger by itself. A
+        busy computer makes such pauses too, but SIGCONT ends none of them. The main thread must ask, which gets it.
+        """
+        if self.rig.simulated_time:
+            return 0.0
+        shortest = self.rig.description.loosest_limits.heartbeat_s
+        pauses = [*self._pauses, (self._checked, time.monotonic())]  # The watch may not have checked since.
+        after = [end - start for start, end in pauses if end > since and start <= self.interrupts.continued]
+        return max((length for length in after if length > shortest), default=0.0)
 
     def _silence(self, passed: float) -> Violation | None:
         """HOST where a watched thread was silent for `thread_s`, RECORDER where a frame has waited for `disk_s`.

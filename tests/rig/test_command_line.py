@@ -316,3 +316,30 @@ def test_what_is_wrong_before_arming_is_one_sentence_and_nothing_moves(tmp_path,
     assert said(done.stderr).count("\n") == 1
     assert (report["off_seq"], report["trip"]) == (0, 0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["plan.toml", "rig.toml"]
+
+
+@pytest.mark.parametrize("lag_s", [3.0, pytest.param(1.0, marks=pytest.mark.long)], ids=["trip", "lag"])
+def test_a_program_that_was_suspended_with_the_drives_on_says_so(tmp_path, lag_s):
+    """What the host finds when it goes on, a trip or its own lag, only follows from that."""
+
+    def attempt():
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        with (
+            real_rig(folder, lag_s=lag_s) as machine,
+            recording(folder, "--yes", stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process,
+        ):
+            wait_for_tension(machine, process)
+            process.send_signal(signal.SIGSTOP)
+            head = machine.report()["head"]
+            assert let_go(machine, head)[0] == Trip.HEARTBEAT
+            while machine.report()["head"] < head + 2000:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGCONT)
+            _, errors = process.communicate(timeout=60)
+        assert re.search(
+            rf"the program was suspended for \d\.\d s \(Ctrl-Z\) with the drives on; the controller's watchdog stopped "
+            rf"them, since it got no heartbeat; {RELEASED}; .* go on with --resume",
+            said(errors.decode()),
+        )
+
+    until_the_machine_keeps_up(attempt)

@@ -1,5 +1,6 @@
 """The watch acts within its own time, whatever call to the controller hangs."""
 
+import signal
 import threading
 import time
 from types import SimpleNamespace
@@ -83,3 +84,21 @@ def test_no_heartbeat_follows_a_stop(watched):
     sent = len(watched.beats)
     time.sleep(0.3)  # six times BEAT_S
     assert len(watched.beats) == sent
+
+
+def test_only_a_pause_that_ends_with_sigcont_is_a_suspension(simulated, tmp_path):
+    """A busy computer makes pauses too, and one from before the last Enter matters no more."""
+    simulated.synchronous = simulated.simulated_time = False
+    recorder, begun = Recorder(tmp_path / "a.wal", {}), time.monotonic()
+    with Interrupts() as interrupts:
+        watch = Watch(simulated, Reader(simulated, recorder, Supervisor(simulated.description)), Nobody(), interrupts)
+        watch._checked -= 5.0
+        assert watch.suspended_s(begun) == 0.0
+        signal.raise_signal(signal.SIGCONT)
+        for _ in range(2):  # before the watch has checked again, and after
+            assert watch.suspended_s(begun) == pytest.approx(5.0, abs=1.0)
+            watch.check()
+        assert watch.suspended_s(time.monotonic()) == 0.0
+        interrupts.continued = begun - 10.0
+        assert watch.suspended_s(begun) == 0.0
+    recorder.close()
