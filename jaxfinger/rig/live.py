@@ -73,7 +73,7 @@ class LiveView(AbstractContextManager):
         except Exception as error:  # Of any kind: the view is no safety function, and nothing else may end with it.
             self.failure = f"the live view has failed ({type(error).__name__}: {error})"
             self._live, self._console = None, Console(file=sys.stderr, soft_wrap=True)
-            self._said.appendleft((f"{self.failure}; recording goes on, and the stop key works.", threading.Event()))
+            self._said.appendleft((f"{self.failure}; recording and stop key do not depend on it.", threading.Event()))
             with suppress(Exception):  # Nobody can be told. A prompt that is not printed is answered by nobody.
                 self._print_until_closed()
 

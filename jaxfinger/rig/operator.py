@@ -19,6 +19,7 @@ READ_S = 0.5
 # s between two looks at a prompt, from which on the program was suspended meanwhile. A look takes 0.05 s, and tenths of
 # a second on a busy machine; Ctrl-Z and the fg after it, typed by hand, are farther apart.
 SUSPENDED_S = 1.0
+TERMINAL_GONE = "the operator's terminal is gone"
 
 
 @runtime_checkable
@@ -29,8 +30,11 @@ class Operator(Protocol):
         """Show a prompt. Return when the operator has done it, or when `keep_waiting()` is false."""
         ...
 
-    def stop_requested(self) -> bool:
-        """Whether the operator wants the rig stopped. Must not wait: the same thread allows the heartbeats."""
+    def stop_requested(self) -> bool | str:
+        """Whether the operator wants the rig stopped; a sentence where no stop key was pressed.
+
+        Must not wait: the same thread allows the heartbeats.
+        """
         ...
 
 
@@ -58,6 +62,7 @@ class AtTerminal:
     def __init__(self, say: Callable[[str], threading.Event | None] = print):
         self._say = say
         self._stop = threading.Event()
+        self._gone = ""  # said where the terminal is gone
         self._enter = threading.Event()
         self._resumed = threading.Event()  # after the shell had the terminal
         self._reading = threading.Lock()
@@ -92,13 +97,13 @@ class AtTerminal:
                 self._resumed.set()  # Before any key is read.
             while select.select([self._keys], [], [], 0)[0]:
                 pressed = os.read(self._keys, 64)
-                if not pressed:  # The terminal is gone.
-                    self._stop.set()
+                if not pressed:
+                    self._gone = TERMINAL_GONE
                     return
                 for key in pressed.decode(errors="replace"):
                     self.key(key)
         except (OSError, termios.error):
-            self._stop.set()
+            self._gone = TERMINAL_GONE
         finally:
             self._reading.release()
 
@@ -134,10 +139,10 @@ class AtTerminal:
                 self._enter.clear()  # Nobody can have read the prompt yet, or the key is held down.
                 shown = None if shown is None else time.monotonic()
 
-    def stop_requested(self) -> bool:
-        """Whether q, space or Escape was pressed, or the terminal is gone."""
+    def stop_requested(self) -> bool | str:
+        """Whether q, space or Escape was pressed; a sentence where the terminal is gone."""
         self._poll()
-        return self._stop.is_set()
+        return self._stop.is_set() or self._gone
 
 
 def _take_keys_at_once(keys: int) -> bool:

@@ -26,6 +26,8 @@ SYNC_S = 1.0
 QUEUE_LIMIT = 1_000_000
 # Free bytes that a new session demands: 17 min at 1 kHz with 60 channels, 0.5 MB/s.
 MIN_FREE_BYTES = 500 * 2**20
+# Free bytes without which nothing is armed: 20 s. A full disk may still take a short frame, in the file's last block.
+ARM_FREE_BYTES = 10 * 2**20
 
 
 class Recorder:
@@ -83,8 +85,9 @@ class Recorder:
         limit = time.monotonic() + timeout
         while self._since and self.failure is None and time.monotonic() < limit:
             time.sleep(POLL_S)
-        late = f"{self.path.name}: the disk does not answer within {timeout:g} s" if self._since else ""
-        return self.failure or late
+        if self._since and self.failure is None:
+            return f"{self.path.name}: the disk does not answer within {timeout:g} s"
+        return self.failure or _full(self.path.parent, ARM_FREE_BYTES)
 
     def close(self, timeout: float = 5.0) -> None:
         """Write what is queued, force it to the disk, and end the thread.
@@ -135,9 +138,18 @@ class Recorder:
 
 def _refuse_full_disk(folder: Path) -> None:
     """Raise UserError where a folder's disk has less than MIN_FREE_BYTES, or where there is no such folder."""
+    if full := _full(folder, MIN_FREE_BYTES):
+        raise UserError(f"{full}; a session needs {MIN_FREE_BYTES >> 20} MiB.")
+
+
+def _full(folder: Path, least: int) -> str:
+    """How little a folder's disk has free where it is less than `least` bytes, or an empty string.
+
+    Raises:
+        UserError: there is no such folder.
+    """
     try:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); choose a folder that exists.") from None
-    if free < MIN_FREE_BYTES:
-        raise UserError(f"{folder}: only {free / 2**20:.0f} MiB are free; a session needs {MIN_FREE_BYTES >> 20} MiB.")
+    return f"{folder}: only {free / 2**20:.0f} MiB are free" if free < least else ""

@@ -35,6 +35,7 @@ BEAT_S = 0.05
 # s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
+STOP_KEY = "the operator pressed the stop key"
 JOIN_S = 1.0  # s that closing waits for each thread; one that hangs is then left behind
 
 
@@ -123,12 +124,13 @@ class Watch:
         """Violation OPERATOR once the stop key was pressed or a signal asked the run to end."""
         if self.interrupts.requested:
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, INTERRUPTED)
-        if self.operator.stop_requested():
-            return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, Trip.OPERATOR.sentence)
+        if asked := self.operator.stop_requested():
+            cause = asked if isinstance(asked, str) else STOP_KEY
+            return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, cause)
         return None
 
     def suspended_s(self, since: float) -> float:
-        """Time in s for which the program was suspended, as by Ctrl-Z, after `since` (s, monotonic); 0 where it was not.
+        """Time in s for which the program was suspended (Ctrl-Z) after `since` (s, monotonic); 0 where it was not.
 
         Only what is longer than `heartbeat_s` counts: after that the controller has released the finger by itself. A
         busy computer makes such pauses too, but SIGCONT ends none of them. The main thread must ask, which gets it.

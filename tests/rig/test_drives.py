@@ -21,6 +21,7 @@ from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.session import run
 from jaxfinger.rig.signals import Interrupts
 from jaxfinger.rig.simulated.controller import Controller
+from jaxfinger.rig.watch import Watch
 from tests.rig.conftest import Away, impatient, slot
 
 
@@ -264,6 +265,26 @@ def test_a_disk_that_fills_while_the_drives_are_off_arms_nothing(rig, record, tm
     else:
         assert re.search(says, record(machine, operator=person).cause)
     assert not any(words in prompt for prompt in armed)
+
+
+def test_an_enter_from_before_the_program_was_suspended_arms_nothing(rig, record, monkeypatch):
+    """Ctrl-Z right after Enter: at fg the motors may not move without a new prompt."""
+    machine, armed = SimulatedRig(rig), []
+    person, arm = Away(machine, "nothing"), machine.arm
+
+    def count():
+        armed.append(person.prompts[-1])
+        return arm()
+
+    def suspended(watch, since):
+        return 3.0 if person.prompts and "Couple the external motor" in person.prompts[-1] else 0.0
+
+    machine.arm = count
+    monkeypatch.setattr(Watch, "suspended_s", suspended)
+    outcome = record(machine, operator=person)
+    said = "nothing was armed: the program was suspended for 3.0 s (Ctrl-Z) meanwhile"
+    assert outcome.cause == f"02-ID.4-T3-MCP: {said}; {RELEASED}"
+    assert not any("Couple the external motor" in prompt for prompt in armed)
 
 
 def test_no_prompt_has_hands_at_a_finger_that_a_tendon_pulls(rig, record):

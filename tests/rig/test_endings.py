@@ -23,6 +23,7 @@ from jaxfinger.rig.runner import NO_HINDSIGHT, RELEASED, TENSION_NOT_SEEN_TO_FAL
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
+from jaxfinger.rig.watch import STOP_KEY
 from tests.rig.conftest import serious, slot
 
 
@@ -204,7 +205,7 @@ def test_the_operators_stop_key(rig, record):
 
     machine = SimulatedRig(rig)
     outcome = record(machine, operator=Presses())
-    assert Trip.OPERATOR.sentence in outcome.cause
+    assert STOP_KEY in outcome.cause
     assert machine.controller.trip is Trip.OPERATOR
 
 

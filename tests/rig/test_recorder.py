@@ -1,6 +1,7 @@
 """The recorder: a slow disk neither holds up the reader nor loses samples."""
 
 import errno
+import re
 import threading
 import time
 
@@ -124,3 +125,12 @@ def test_a_log_that_has_taken_its_frames_lacks_nothing_and_one_that_hangs_is_sai
     Slow.go.set()
     assert log.lacks(60.0) == ""
     log.close(60.0)
+
+
+def test_a_disk_that_takes_only_a_short_frame_more_is_full(tmp_path, monkeypatch):
+    """The last block of a file has room where the disk has none."""
+    log = Recorder(tmp_path / "a.wal", {})
+    assert log.lacks(60.0) == ""
+    monkeypatch.setattr(module, "ARM_FREE_BYTES", 1 << 60)
+    assert re.fullmatch(f"{tmp_path}: only [0-9]+ MiB are free", log.lacks(60.0))
+    log.close()
