@@ -203,6 +203,14 @@ class Course:
         self._was_on |= bool(np.isin(block.state, DRIVES_ON).any())
         return self._was_on and int(block.state[-1]) in (State.INIT, State.IDLE, State.RELEASING)
 
+    def seen_off(self, block: Block | None) -> bool:
+        """Whether a block's end shows the controller stopped or idle, which has the drives off.
+
+        An idle one from before the drives were switched on says nothing.
+        """
+        idle = block is not None and int(block.state[-1]) == State.IDLE
+        return tripped(block) or (idle and (self._was_on or not self.drives_on))
+
     def heed_stop_key(self) -> None:
         """Stop the rig and raise TrialEnded where the stop key was pressed or a signal came.
 

@@ -158,9 +158,7 @@ class Drives:
 
     def released(self) -> bool:
         """Whether the newest sample shows the controller stopped or idle, and no drive's tension."""
-        block = self.reader.latest
-        idle = block is not None and (tripped(block) or int(block.state[-1]) == State.IDLE)
-        return idle and not self._pulled()
+        return self.course.seen_off(self.reader.latest) and not self._pulled()
 
     def _ask_until_fixed(self, setup: Setup) -> None:
         """Ask a person to prepare the finger, again while the encoder of a fixed joint reads another angle."""

@@ -13,6 +13,7 @@ import pytest
 from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import recorder, recover, wal
+from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.course import Course
@@ -332,6 +333,23 @@ def test_a_tension_that_cannot_be_seen_was_not_seen_to_fall(rig, record):
     outcome = record(machine, lambda m: m.inject("nan", slot(m, "tension", "T3")))
     assert max(machine.controller.setpoint) == 0.0
     assert TENSION_NOT_SEEN_TO_FALL in outcome.cause
+
+
+def test_a_controller_that_is_lost_as_the_drives_go_on_was_not_seen_to_release(rig, record):
+    """The newest sample is from before, and shows it idle."""
+    machine = SimulatedRig(rig)
+    arm = machine.arm
+
+    def lost(*_):
+        raise ConnectionLost("the connection to the controller is lost.")
+
+    def arm_and_cut():
+        number = arm()
+        machine.read_block = machine.stop = machine.release = machine.status = machine.command = lost
+        return number
+
+    machine.arm = arm_and_cut
+    assert record(machine).cause == f"the connection to the controller is lost; {TENSION_NOT_SEEN_TO_FALL}"
 
 
 def test_a_tension_that_fell_is_not_asked_for(rig, record):
