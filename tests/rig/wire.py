@@ -23,9 +23,10 @@ from jaxfinger.data import read_session
 from jaxfinger.errors import UserError
 from jaxfinger.rig import matrix, parse_plan, parse_rig, run, wal
 from jaxfinger.rig.backends.ads import AdsRig
-from jaxfinger.rig.contract import State
+from jaxfinger.rig.contract import State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
+from jaxfinger.rig.watch import STOP_KEY
 
 PLAN = '[plan]\nname = "hold"\noperator = "tester"\n[[trial]]\nexperiment = "VD.1"\npretension = 8.0\nseconds = 30.0\n'
 STALL_S = 0.03  # s; a tenth of matrix.STOP_S
@@ -246,7 +247,8 @@ def judge(found: Found) -> list[str]:
         faults.append(f"ended after {found.end_s} s")
     if found.missing_s is not None and found.missing_s > matrix.LOST_S:
         faults.append(f"{found.missing_s} s missing")
-    causes = [trip.sentence for trip in row.causes] + SAYS.get(found.cell.row, [])
+    causes = [STOP_KEY if trip is Trip.OPERATOR else trip.sentence for trip in row.causes]
+    causes += SAYS.get(found.cell.row, [])
     if found.cell.phase != "letting go" and not any(cause in found.cause for cause in causes):
         faults.append(f"cause: {found.cause}")
     return faults
@@ -264,7 +266,7 @@ SAYS = {
     "beat": ["a call to the controller hangs", "the host's heartbeat was silent"],
     "disk": ["disk does not answer"],
     "full": ["No space left"],
-    "deaf": ["the operator pressed the stop key"],
+    "deaf": [STOP_KEY],
     "watch": ["connection to the controller"],
 }
 
