@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from jaxfinger.rig.contract import Trip
-from jaxfinger.rig.operator import Nobody
+from jaxfinger.rig.operator import TERMINAL_GONE, Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor
@@ -28,9 +28,9 @@ def until(condition) -> bool:
 class Pressing(Nobody):
     """An operator whose stop key can be pressed."""
 
-    pressed = False
+    pressed: bool | str = False
 
-    def stop_requested(self) -> bool:
+    def stop_requested(self) -> bool | str:
         return self.pressed
 
 
@@ -74,6 +74,12 @@ def test_a_heartbeat_that_hangs_in_its_call_is_a_silent_thread(watched):
     assert until(lambda: watched.reader.violation is not None)
     assert watched.reader.violation.trip is Trip.HOST
     assert "heartbeat" in watched.reader.violation.sentence
+
+
+def test_a_terminal_that_is_gone_is_no_stop_key(watched):
+    watched.operator.pressed = TERMINAL_GONE
+    assert until(lambda: watched.reader.violation is not None)
+    assert watched.reader.violation.sentence == TERMINAL_GONE
 
 
 def test_no_heartbeat_follows_a_stop(watched):
