@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
 # Options of glibc's malloc.h: the number of heaps, the size from which a block is mapped apart (32 MiB at most), and
 # the free memory from which a heap is given back. By default each array of a channel is mapped anew, and the kernel
 # clears its pages, which takes a tenth of the time of `identify`.
@@ -27,6 +28,14 @@ FULL_COLLECTIONS = 100
 
 def main(tokens: Sequence[str] | None = None) -> None:
     """Entry point of `jaxfinger`. A mistake that the user can mend ends in one sentence and exit code 2."""
+    try:
+        _run(tokens)
+    except KeyboardInterrupt:  # While modules are imported; cyclopts takes it once a command runs.
+        raise SystemExit(INTERRUPTED) from None
+
+
+def _run(tokens: Sequence[str] | None) -> None:
+    """Run the command that the line names."""
     _environment()
     _one_heap()
     gc.set_threshold(*gc.get_threshold()[:2], FULL_COLLECTIONS)

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+from jaxfinger import cli
 from jaxfinger.cli import main, tables
 from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
 from jaxfinger.report.numbers import number
@@ -28,6 +29,15 @@ def run(*tokens) -> int:
     except SystemExit as end:
         return end.code or 0
     return 0
+
+
+def test_ctrl_c_while_modules_are_imported_ends_without_a_traceback(monkeypatch, capsys):
+    def pressed() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_streams", pressed)  # the last step before the command's modules are imported
+    assert run("show", "fit.json") == 130
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.fixture(scope="module")
