@@ -141,7 +141,11 @@ def estimate(
     own, whole = [_autoregression(c) for c in series], _autoregression([s for column in series for s in column])
     if not own:  # the channel has no column, as excursions of a machine without tendons
         return Noise(np.zeros(0), np.zeros(0), np.zeros((0, *np.shape(whole[2]))), source)
-    sizes = [row[0] if _count(c) > MIN_SAMPLES_FOR_STD else whole[0] for c, row in zip(series, own, strict=True)]
+    few = [_count(c) <= MIN_SAMPLES_FOR_STD for c in series]
+    sizes = [whole[0] if less else row[0] for less, row in zip(few, own, strict=True)]
+    if any(few) and source != "residuals":
+        beside = _sizes_beside(series, _fast_part(residual, mask, window))
+        sizes = [beside.get(c, size) if few[c] else size for c, size in enumerate(sizes)]
     scaled = [(e / size, m, lost) for c, size in zip(series, sizes, strict=True) for e, m, lost in c]
     unit, spread, colour = _autoregression(scaled)
     rows = [
@@ -200,6 +204,16 @@ def _at_least(noise: Noise, stack: Stack, channel: str) -> Noise:
 
 # Values, which of them are valid, and the share of their covariance that removing a mean or a line takes from each lag.
 Series = list[tuple[np.ndarray, np.ndarray, float]]
+
+
+def _sizes_beside(series: list[Series], fast: list[Series]) -> dict[int, float]:
+    """Standard deviation of each column whose fast part has samples enough: that part's own, times what the noise of
+    all these columns is of their fast parts. Columns may differ in size and unit, and a fast part is not all of the
+    noise.
+    """
+    sizes = {c: _autoregression(part)[0] for c, part in enumerate(fast) if _count(part) > MIN_SAMPLES_FOR_STD}
+    share, _, _ = _autoregression([(e / size, m, lost) for c, size in sizes.items() for e, m, lost in series[c]])
+    return {c: share * size for c, size in sizes.items()}
 
 
 def _count(column: Series) -> int:

@@ -118,6 +118,20 @@ def test_a_column_that_hardly_counts_borrows_the_size_of_the_channel(estimates):
     assert all(0.2 * SIZES[0] < noise.innovation[2] < SIZES[1] for noise, _ in estimates)
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 30.0])
+def test_a_column_with_few_repeated_samples_has_the_size_that_its_other_samples_show(size):
+    """A column of another unit, say: of each repeat 20 samples count, and 400 of a trial that nothing repeats."""
+    sizes = np.array([1.0, size])
+    found = []
+    for seed in range(6):
+        residual = sizes[:, None, None] * coloured(np.random.default_rng(seed), (2, 3))
+        mask = np.zeros_like(residual)
+        mask[0, :, 100:1100] = mask[1, :2, 100:120] = mask[1, 2, 100:500] = 1.0
+        stack = replace(stack_of(residual, mask, ("a", "a", None), 0.01), trials=("1", "2", "3"))
+        found.append(estimate(stack, "joint_torque", residual).innovation)
+    np.testing.assert_allclose(np.mean(found, axis=0), sizes, rtol=0.15)
+
+
 def swept(law, seed, passes=4, samples=120):
     """A trial that sweeps a joint to and fro, with a law of its angle and direction in coloured noise."""
     forth = np.linspace(-1.0, 1.0, samples)
