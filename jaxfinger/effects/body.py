@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
+from jaxfinger.effects.rotation import turned
 
 # Largest share of a link's mass that an effect may remove. The equations divide by the mass that is left, so it has to
 # stay positive. CAD is never wrong by nine tenths of a mass: the bound excludes no plausible link.
@@ -59,7 +60,7 @@ def _steiner(mass, com):
 
 
 class GravityTilt(CatalogueEffect):
-    """g + φ × g, φ = (x, y, z): the finger is mounted at another angle than described (first order in φ)."""
+    """R(φ) g, φ = (x, y, z): the finger is mounted at another angle than described, turned by the vector φ."""
 
     ID: ClassVar = "gravity_tilt"
     PLACE: ClassVar = "base"
@@ -73,7 +74,7 @@ class GravityTilt(CatalogueEffect):
 
     def finger(self, finger):
         tilt = jnp.stack([self.x, self.y, self.z])
-        return eqx.tree_at(lambda f: f.gravity, finger, finger.gravity + jnp.cross(tilt, finger.gravity))
+        return eqx.tree_at(lambda f: f.gravity, finger, turned(finger.gravity, tilt))
 
 
 class DriveInertia(CatalogueEffect):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
+from jaxfinger.effects.rotation import turned
 
 # Central differences of the sixth order: distance in samples, and weight (Fornberg, Math. Comp. 51 (1988) 699).
 _SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))
@@ -132,7 +133,7 @@ class EncoderEccentricity(_Encoder):
 
 
 class ForceSensorRotation(CatalogueEffect):
-    """F + φ × F, φ = (x, y, z): the fingertip's force sensor is turned against the base frame (first order in φ)."""
+    """R(φ) F, φ = (x, y, z): the fingertip's force sensor is turned against the base frame, by the vector φ."""
 
     ID: ClassVar = "force_sensor_rotation"
     PLACE: ClassVar = "fingertip"
@@ -147,8 +148,7 @@ class ForceSensorRotation(CatalogueEffect):
     def reading(self, channel, x, y):
         if channel != "fingertip_force":
             return y
-        a, b, c = self.x, self.y, self.z
-        return y + jnp.stack([b * y[2] - c * y[1], c * y[0] - a * y[2], a * y[1] - b * y[0]])
+        return turned(y, jnp.stack([self.x, self.y, self.z]))
 
 
 # Channels that may lag the others; their order gives the index of a site.
