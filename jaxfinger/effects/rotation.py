@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-TINY = 1e-300  # of an angle squared: it keeps the derivative at no rotation finite, which JAX's own `Rotation` lacks
+TINY = 1e-300  # of an angle squared. It keeps the derivative at no rotation finite, which JAX's own class lacks.
 
 
 def turned(v: Float[Array, "xyz ..."], by: Float[Array, " xyz"]) -> Float[Array, "xyz ..."]:
