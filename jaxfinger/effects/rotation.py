@@ -3,7 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-TINY = 1e-300  # of an angle squared. It keeps the derivative at no rotation finite, which JAX's own class lacks.
+# Added to an angle squared: far below that of any rotation, and above zero, where a root has no derivative. JAX's own
+# class of rotations has none there.
+TINY = 1e-300
 
 
 def turned(v: Float[Array, "xyz ..."], by: Float[Array, " xyz"]) -> Float[Array, "xyz ..."]:

@@ -1,9 +1,9 @@
 """The part of a residual that smooth laws, with or without memory, could explain.
 
 Features of a column are polynomials of angles and tensions, functions of speed, direction, time, and of the distance
-since the last reversal; speeds and directions also times angles. They bound what any listed or unlisted law could
-explain; they never name a cause. The direction in which a tendon moves is none: where it rests, its measured excursion
-tells it, whose noise is in the residual too.
+since the last reversal; speeds and directions also times polynomials of angles. They bound what any listed or unlisted
+law could explain; they never name a cause. The direction in which a tendon moves is none: where it rests, its measured
+excursion tells it, whose noise is in the residual too.
 """
 
 from collections.abc import Iterator
@@ -64,6 +64,7 @@ def features(
     }
     for i in own:
         u = _unit(q[i])
+        # Powers of an angle would be nearly collinear, also times a speed or a direction.
         chebyshev = [np.cos(k * np.arccos(u)) for k in range(7)]
         out["q"] += chebyshev[1:]
         v = _unit(qd[i])

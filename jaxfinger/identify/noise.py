@@ -144,8 +144,8 @@ def estimate(
     few = [_count(c) <= MIN_SAMPLES_FOR_STD for c in series]
     sizes = [whole[0] if less else row[0] for less, row in zip(few, own, strict=True)]
     if any(few) and source != "residuals":
-        beside = _sizes_beside(series, _fast_part(residual, mask, window))
-        sizes = [beside.get(c, size) if few[c] else size for c, size in enumerate(sizes)]
+        by_fast = _sizes_by_fast_parts(series, _fast_part(residual, mask, window))
+        sizes = [by_fast.get(c, size) if few[c] else size for c, size in enumerate(sizes)]
     scaled = [(e / size, m, lost) for c, size in zip(series, sizes, strict=True) for e, m, lost in c]
     unit, spread, colour = _autoregression(scaled)
     rows = [
@@ -206,10 +206,10 @@ def _at_least(noise: Noise, stack: Stack, channel: str) -> Noise:
 Series = list[tuple[np.ndarray, np.ndarray, float]]
 
 
-def _sizes_beside(series: list[Series], fast: list[Series]) -> dict[int, float]:
-    """Standard deviation of each column whose fast part has samples enough: that part's own, times what the noise of
-    all these columns is of their fast parts. Columns may differ in size and unit, and a fast part is not all of the
-    noise.
+def _sizes_by_fast_parts(series: list[Series], fast: list[Series]) -> dict[int, float]:
+    """Standard deviations of the columns whose fast parts have samples enough, in their own units.
+
+    A fast part is not all of the noise. The ratio of the two is taken to be one for all columns.
     """
     sizes = {c: _autoregression(part)[0] for c, part in enumerate(fast) if _count(part) > MIN_SAMPLES_FOR_STD}
     share, _, _ = _autoregression([(e / size, m, lost) for c, size in sizes.items() for e, m, lost in series[c]])

@@ -19,19 +19,20 @@ READ_S = 0.5
 # s between two looks at a prompt, from which on the program was suspended meanwhile. A look takes 0.05 s, and tenths of
 # a second on a busy machine; Ctrl-Z and the fg after it, typed by hand, are farther apart.
 SUSPENDED_S = 1.0
-TERMINAL_GONE = "the operator's terminal is gone"
+# Why an operator wants the rig stopped.
+STOP_KEY, TERMINAL_GONE = "the operator pressed the stop key", "the operator's terminal is gone"
 
 
 @runtime_checkable
 class Operator(Protocol):
-    """Answers prompts, and can stop the run at any time. The watch asks `stop_requested` every 20 ms."""
+    """Answers prompts, and can stop the run at any time. The watch asks for the `stop_request` every 20 ms."""
 
     def ask(self, text: str, keep_waiting: Callable[[], bool]) -> None:
         """Show a prompt. Return when the operator has done it, or when `keep_waiting()` is false."""
         ...
 
-    def stop_requested(self) -> bool | str:
-        """Whether the operator wants the rig stopped; a sentence where no stop key was pressed.
+    def stop_request(self) -> str:
+        """Say why the operator wants the rig stopped, in a sentence; empty while it may run.
 
         Must not wait: the same thread allows the heartbeats.
         """
@@ -45,9 +46,9 @@ class Nobody:
         """Raise UserError: nobody is there to do it."""
         raise UserError(f"a person must do this, so run without --yes: {text}")
 
-    def stop_requested(self) -> bool:
-        """Return False."""
-        return False
+    def stop_request(self) -> str:
+        """Return an empty string: nobody stops the run."""
+        return ""
 
 
 class AtTerminal:
@@ -61,8 +62,7 @@ class AtTerminal:
 
     def __init__(self, say: Callable[[str], threading.Event | None] = print):
         self._say = say
-        self._stop = threading.Event()
-        self._gone = ""  # said where the terminal is gone
+        self._request = ""  # why the rig is to be stopped
         self._enter = threading.Event()
         self._resumed = threading.Event()  # after the shell had the terminal
         self._reading = threading.Lock()
@@ -98,19 +98,19 @@ class AtTerminal:
             while select.select([self._keys], [], [], 0)[0]:
                 pressed = os.read(self._keys, 64)
                 if not pressed:
-                    self._gone = TERMINAL_GONE
+                    self._request = self._request or TERMINAL_GONE
                     return
                 for key in pressed.decode(errors="replace"):
                     self.key(key)
         except (OSError, termios.error):
-            self._gone = TERMINAL_GONE
+            self._request = self._request or TERMINAL_GONE
         finally:
             self._reading.release()
 
     def key(self, key: str) -> None:
         """Act on one key."""
         if key in ("q", "Q", " ", "\x1b"):
-            self._stop.set()
+            self._request = STOP_KEY
         elif key in ("\n", "\r"):
             self._enter.set()
 
@@ -125,7 +125,7 @@ class AtTerminal:
         self._resumed.clear()
         self._enter.clear()
         printed, shown, looked = self._say(prompt), None, time.monotonic()
-        while not self.stop_requested() and keep_waiting():
+        while not self.stop_request() and keep_waiting():
             passed, looked = time.monotonic() - looked, time.monotonic()
             if self._resumed.is_set() or passed > SUSPENDED_S:
                 self._resumed.clear()
@@ -139,10 +139,10 @@ class AtTerminal:
                 self._enter.clear()  # Nobody can have read the prompt yet, or the key is held down.
                 shown = None if shown is None else time.monotonic()
 
-    def stop_requested(self) -> bool | str:
-        """Whether q, space or Escape was pressed; a sentence where the terminal is gone."""
+    def stop_request(self) -> str:
+        """STOP_KEY once q, space or Escape was pressed, TERMINAL_GONE once the terminal is gone."""
         self._poll()
-        return self._stop.is_set() or self._gone
+        return self._request
 
 
 def _take_keys_at_once(keys: int) -> bool:

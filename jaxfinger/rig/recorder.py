@@ -26,7 +26,8 @@ SYNC_S = 1.0
 QUEUE_LIMIT = 1_000_000
 # Free bytes that a new session demands: 17 min at 1 kHz with 60 channels, 0.5 MB/s.
 MIN_FREE_BYTES = 500 * 2**20
-# Free bytes without which nothing is armed: 20 s. A full disk may still take a short frame, in the file's last block.
+# Free bytes without which nothing is armed: 20 s at that rate, in which a stop and its release end. A full disk may
+# still take a short frame, in the file's last block.
 ARM_FREE_BYTES = 10 * 2**20
 
 

@@ -35,7 +35,6 @@ BEAT_S = 0.05
 # s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
-STOP_KEY = "the operator pressed the stop key"
 JOIN_S = 1.0  # s that closing waits for each thread; one that hangs is then left behind
 
 
@@ -124,8 +123,7 @@ class Watch:
         """Violation OPERATOR once the stop key was pressed or a signal asked the run to end."""
         if self.interrupts.requested:
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, INTERRUPTED)
-        if asked := self.operator.stop_requested():
-            cause = asked if isinstance(asked, str) else STOP_KEY
+        if cause := self.operator.stop_request():
             return Violation.of_host(Trip.OPERATOR, self.reader.latest_seq, cause)
         return None
 

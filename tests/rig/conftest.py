@@ -122,8 +122,8 @@ class Away:
         self.by_itself(self.wanted[-1])
         self.machine._pause(1.0)
 
-    def stop_requested(self):
-        return False
+    def stop_request(self):
+        return ""
 
 
 def impatient(rig, seconds=0.2):

@@ -398,8 +398,8 @@ def test_a_prompt_ends_where_the_controller_lets_go(lockstep, record, kind):
                 time.sleep(0.01)
             waited.append(keep_waiting())
 
-        def stop_requested(self):
-            return False
+        def stop_request(self):
+            return ""
 
     outcome = record(rig, operator=Person())
     assert waited == [False]

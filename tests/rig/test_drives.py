@@ -12,7 +12,7 @@ from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Kind, Refusal, State, Trip
 from jaxfinger.rig.course import Course
 from jaxfinger.rig.drives import Drives
-from jaxfinger.rig.operator import Nobody
+from jaxfinger.rig.operator import STOP_KEY, Nobody
 from jaxfinger.rig.protocols import Settled
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
@@ -41,8 +41,8 @@ def test_a_stop_key_at_a_prompt_is_no_answer_to_it(rig, tmp_path):
     """The watch may be 20 ms behind the key: the runner looks for itself before it sends the next command."""
 
     class Stopping(Nobody):
-        def stop_requested(self) -> bool:
-            return True
+        def stop_request(self) -> str:
+            return STOP_KEY
 
     machine = SimulatedRig(rig)
     machine.synchronous = False
@@ -69,8 +69,8 @@ def test_a_person_at_a_bench_that_prepares_nothing_itself(rig, record):
             by_itself(wanted[-1])
             machine._pause(1.0)
 
-        def stop_requested(self):
-            return False
+        def stop_request(self):
+            return ""
 
     outcome = record(machine, operator=Person())
     assert outcome.cause == ""
@@ -141,8 +141,8 @@ def test_a_joint_that_is_not_fixed_as_asked_is_asked_for_again(rig, record):
             by_itself(wanted[-1])
             machine._pause(1.0)
 
-        def stop_requested(self):
-            return len(prompts) > 4
+        def stop_request(self):
+            return STOP_KEY if len(prompts) > 4 else ""
 
     outcome = record(machine, operator=Person())
     assert prompts[1].startswith("The drives are off. Fix all joints: MCP 20°, PIP 20°")
@@ -408,7 +408,7 @@ def test_a_controller_that_does_not_answer_its_stop_at_a_finger_that_a_tendon_pu
 def test_the_stop_key_at_a_finger_that_a_tendon_pulls(rig, record):
     machine = SimulatedRig(rig)
     person = Handy(machine, 6.0, 20)
-    person.stop_requested = lambda: bool(person.armed)
+    person.stop_request = lambda: STOP_KEY if person.armed else ""
     outcome = record(machine, operator=person)
     assert outcome.cause == f"02-ID.4-T3-MCP: the operator pressed the stop key; {TENSION_NOT_SEEN_TO_FALL}"
     assert machine.controller.state is State.TRIPPED

@@ -17,14 +17,13 @@ from jaxfinger.rig.backend import ConnectionLost
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Kind, State, Trip
 from jaxfinger.rig.course import Course
-from jaxfinger.rig.operator import Nobody
+from jaxfinger.rig.operator import STOP_KEY, Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.runner import NO_HINDSIGHT, RELEASED, TENSION_NOT_SEEN_TO_FALL, Runner
 from jaxfinger.rig.safety import Supervisor
 from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.signals import ENDING, Interrupts
-from jaxfinger.rig.watch import STOP_KEY
 from tests.rig.conftest import serious, slot
 
 
@@ -200,9 +199,9 @@ def test_the_operators_stop_key(rig, record):
         def ask(self, text, keep_waiting):
             raise AssertionError("a simulated rig prepares itself")
 
-        def stop_requested(self):
+        def stop_request(self):
             self.asked += 1
-            return self.asked > 60
+            return STOP_KEY if self.asked > 60 else ""
 
     machine = SimulatedRig(rig)
     outcome = record(machine, operator=Presses())

@@ -131,9 +131,9 @@ def test_keys_at_the_terminal(key, monkeypatch):
     person.key("\n")
     answered.join(20)
     assert not answered.is_alive()
-    assert not person.stop_requested()
+    assert not person.stop_request()
     person.key(key)
-    assert person.stop_requested()
+    assert person.stop_request()
     person.ask("again", lambda: True)  # Returns at once: the rig is being stopped.
     AtTerminal(said.append).ask("dead", lambda: False)
 
@@ -172,13 +172,13 @@ def test_the_stop_key_works_after_the_program_was_suspended():
     ours, theirs = pty.openpty()
     person = AtTerminal()
     person._keys = theirs
-    assert not person.stop_requested()
+    assert not person.stop_request()
     lines = termios.tcgetattr(theirs)
     lines[3] |= termios.ICANON
     termios.tcsetattr(theirs, termios.TCSANOW, lines)
-    assert not person.stop_requested()
+    assert not person.stop_request()
     os.write(ours, b"q")
-    assert person.stop_requested()
+    assert person.stop_request()
     os.close(ours)
     os.close(theirs)
 
@@ -214,9 +214,9 @@ def test_a_terminal_that_is_gone_is_a_stop():
     ours, theirs = os.pipe()
     person = AtTerminal()
     person._keys = ours
-    assert not person.stop_requested()
+    assert not person.stop_request()
     os.close(theirs)
-    assert person.stop_requested() == TERMINAL_GONE
+    assert person.stop_request() == TERMINAL_GONE
     os.close(ours)
 
 
@@ -231,7 +231,7 @@ def test_an_enter_from_before_the_prompt_does_not_answer_it():
     assert next(looks, None) is None  # It went on asking until the rig had to be stopped.
     os.write(theirs, b"q\n")
     person.ask("again", lambda: True)
-    assert person.stop_requested()  # A stop key counts, whenever it was pressed.
+    assert person.stop_request()  # A stop key counts, whenever it was pressed.
     os.close(ours)
     os.close(theirs)
 

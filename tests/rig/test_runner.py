@@ -13,6 +13,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import parse_plan, parse_rig
 from jaxfinger.rig.backends.simulated import SimulatedRig
 from jaxfinger.rig.contract import Flag, State
+from jaxfinger.rig.operator import STOP_KEY
 from jaxfinger.rig.runner import RELEASED
 from jaxfinger.rig.session import log_path, run
 from jaxfinger.rig.simulated.controller import Controller
@@ -114,7 +115,7 @@ def test_the_view_at_a_prompt_and_after_a_stop_shows_the_newest_samples(rig, sho
     """Hands are at an armed finger, and then it is stopped: an old tension on the screen would be a wrong one."""
     machine, views = SimulatedRig(rig), []
     person = Away(machine, "Hold DIP", late=0.2)
-    person.stop_requested = lambda: "Hold DIP" in person.prompts[-1] if person.prompts else False
+    person.stop_request = lambda: STOP_KEY if person.prompts and "Hold DIP" in person.prompts[-1] else ""
     outcome = run(short, machine, tmp_path / "s.h5", operator=person, observe=views.append)
     assert outcome.cause.endswith(RELEASED)
     at_prompt = [v for v in views if v.doing == "waiting for Enter" and int(v.block.state[-1]) == State.ARMED]

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from jaxfinger.rig.contract import Trip
-from jaxfinger.rig.operator import TERMINAL_GONE, Nobody
+from jaxfinger.rig.operator import STOP_KEY, TERMINAL_GONE, Nobody
 from jaxfinger.rig.reader import Reader
 from jaxfinger.rig.recorder import Recorder
 from jaxfinger.rig.safety import Supervisor
@@ -26,12 +26,12 @@ def until(condition) -> bool:
 
 
 class Pressing(Nobody):
-    """An operator whose stop key can be pressed."""
+    """An operator who can ask for a stop."""
 
-    pressed: bool | str = False
+    asked = ""
 
-    def stop_requested(self) -> bool | str:
-        return self.pressed
+    def stop_request(self) -> str:
+        return self.asked
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_the_stop_key_is_heard_while_a_heartbeat_hangs_in_its_call(watched):
     watched.hang.set()
     sent = len(watched.beats)
     assert until(lambda: len(watched.beats) > sent)  # This one hangs.
-    watched.operator.pressed = True
+    watched.operator.asked = STOP_KEY
     assert until(lambda: watched.reader.violation is not None)
     assert watched.reader.violation.trip is Trip.OPERATOR
 
@@ -77,14 +77,14 @@ def test_a_heartbeat_that_hangs_in_its_call_is_a_silent_thread(watched):
 
 
 def test_a_terminal_that_is_gone_is_no_stop_key(watched):
-    watched.operator.pressed = TERMINAL_GONE
+    watched.operator.asked = TERMINAL_GONE
     assert until(lambda: watched.reader.violation is not None)
     assert watched.reader.violation.sentence == TERMINAL_GONE
 
 
 def test_no_heartbeat_follows_a_stop(watched):
     assert until(lambda: len(watched.beats) > 2)
-    watched.operator.pressed = True
+    watched.operator.asked = STOP_KEY
     assert until(lambda: watched.reader.violation is not None)
     time.sleep(0.05)  # for one that was on its way
     sent = len(watched.beats)

@@ -24,9 +24,9 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig import matrix, parse_plan, parse_rig, run, wal
 from jaxfinger.rig.backends.ads import AdsRig
 from jaxfinger.rig.contract import State, Trip
+from jaxfinger.rig.operator import STOP_KEY
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.examples import rig_toml
-from jaxfinger.rig.watch import STOP_KEY
 
 PLAN = '[plan]\nname = "hold"\noperator = "tester"\n[[trial]]\nexperiment = "VD.1"\npretension = 8.0\nseconds = 30.0\n'
 STALL_S = 0.03  # s; a tenth of matrix.STOP_S
@@ -91,9 +91,9 @@ class Host:
     def ask(self, text, keep_waiting):
         raise AssertionError("the stand-in prepares itself")
 
-    def stop_requested(self) -> bool:
+    def stop_request(self) -> str:
         self.hang("watch")
-        return self.pressed
+        return STOP_KEY if self.pressed else ""
 
     def strike(self, bench: standin.StandIn, what: str) -> dict[str, Any]:
         if what in ("key", "deaf", "mute"):

@@ -22,6 +22,7 @@ from jaxfinger.data.checks.work import check_work
 from jaxfinger.data.findings import Report
 from jaxfinger.data.schema import MEASURED
 from jaxfinger.data.session import EXPERIMENT_NAMES, Session
+from jaxfinger.data.signals.arms import Excursions
 from jaxfinger.data.signals.quantiles import median
 from jaxfinger.data.signals.sizes import MAX_SAMPLES, Sizes, sizes_of
 from jaxfinger.data.signals.spikes import longest_spike, outlier_mask
@@ -137,9 +138,10 @@ def check_samples(session: Session, report: Report) -> None:
     with np.errstate(all="ignore"):
         check_spikes(session, report)
         if report.fatal is None:
-            check_work(session, report)
+            kinematic = Excursions(session)
+            check_work(session, kinematic, report)
             check_columns(session, report)
-            check_paths(session, report)
+            check_paths(session, kinematic, report)
             check_copied_columns(session, report)
             check_gravity(session, report)
             check_torque_scales(session, report)

@@ -28,8 +28,6 @@ _MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
-_MAX_EXCURSION_RATIO = 3.0  # of two measurements of one excursion: units that people confuse differ by more.
-_MIN_PATH = 0.01  # of the finger's length, of excursion: over less, stretch and noise decide a ratio of two.
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
@@ -38,16 +36,14 @@ _MIN_TURNS = 3  # of a motion: with fewer, torque that accelerates the joint loo
 _MAX_NEGATIVE_FRICTION = 0.05  # of the torque's spread: a delay between the channels makes friction seem this negative.
 
 
-def check_work(session: Session, report: Report) -> None:
-    """Report channels that contradict each other."""
+def check_work(session: Session, kinematic: Excursions, report: Report) -> None:
+    """Report channels that contradict each other. `kinematic`: the excursions of ID.2."""
     finger = session.finger
     if any(finger.prismatic) or not finger.n:
         _passivity(session, report)
         return
-    kinematic = Excursions(session)
     _arm_lengths(kinematic.arms, finger, report)
     _virtual_work(session, kinematic, report)
-    _free_paths(session, kinematic, report)
     _fingertip(session, report)
     _passivity(session, report)
 
@@ -112,31 +108,6 @@ def suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, s
     if len(joints) == 1 and tendons <= sound_tendons and not joints & sound_joints:
         return f"joint_torque or q of {min(joints)}"
     return "joint_torque, tendon_excursion, tendon_force or q"
-
-
-def _free_paths(session: Session, kinematic: Excursions, report: Report) -> None:
-    """Report free motions whose excursions contradict those of ID.2."""
-    finger = session.finger
-    found = []
-    for trial in session.select("VD.1", "VD.3"):
-        if trial.tendon_excursion is None:
-            continue
-        q, l = thinned(trial.q), thinned(trial.tendon_excursion)
-        for k in np.flatnonzero(finger.active):
-            joints = np.flatnonzero(finger.crosses[k])
-            if any((int(k), int(i)) not in kinematic.polynomials for i in joints) or not len(joints):
-                continue
-            expected = np.sum([kinematic.polynomials[int(k), int(i)](q[:, i]) for i in joints], axis=0)
-            ratio = slope(expected, l[:, k])
-            agree = 1.0 / _MAX_EXCURSION_RATIO < ratio < _MAX_EXCURSION_RATIO
-            if np.isfinite(ratio) and not agree and np.ptp(expected) > _MIN_PATH * finger.length:
-                found.append(f"{finger.tendon_names[k]} in {trial.name} ({ratio:.2g} times)")
-    if found:
-        report.warning(
-            "/trials",
-            f"excursions along free paths are not those that ID.2 shows: {listed(found, 3)}; check sign, units and "
-            "columns of tendon_excursion and q in these trials",
-        )
 
 
 def _fingertip(session: Session, report: Report) -> None:

@@ -28,10 +28,9 @@ from jaxfinger.errors import UserError, listed
 # Names of the column that says which signal a row is of, beside a column that is called a value; and of one that says
 # whose the row is.
 _SIGNAL = r"signal|topic|channel|kanal|variable|sensor|name|metric|field|measurement|quantity|parameter|key|tag|path"
-_WHOSE = (
-    r"(?=.)(joint|motor|servo|actuator|drive|axis|dof|tendon|finger|sensor|channel|device|dev|node|can|board|module"
-)
-_WHOSE += r"|source|src|sender|port|bus|message|msg|type|kind|tag)?[_ ]?(name|id|index|number|no|nr|type)?"
+_OWNER = r"joint|motor|servo|actuator|drive|axis|dof|tendon|finger|sensor|channel|device|dev|node|can|board|module"
+_OWNER += r"|source|src|sender|port|bus|message|msg|type|kind|tag"
+_WHOSE = rf"(?=.)({_OWNER})?[_ ]?(name|id|index|number|no|nr|type)?"
 _VALUE = r"(value|val|data|reading|wert|messwert|valeur)s?"
 _UNIT = r"units?|einheit"
 _MAX_LABELS = 100  # different signals; more are no names

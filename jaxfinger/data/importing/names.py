@@ -117,8 +117,10 @@ def is_time_step(name: str, x: np.ndarray) -> bool:
     """Whether a column holds the times between samples in place of times: by its name, and since it goes up and down
     as often, or stays the same, where a clock goes on."""
     word = re.sub(r"_(s|sec|ms|us|ns)$", "", words(re.split(r"[./]", without_units(name))[-1]))
+    if x.ndim > 1 or re.fullmatch(_TIME_STEP, word) is None:
+        return False
     x = x[1:][np.isfinite(x[1:])]  # The first sample has none before it.
-    if x.ndim > 1 or re.fullmatch(_TIME_STEP, word) is None or np.any(x < 0.0) or not np.any(x > 0.0):
+    if np.any(x < 0.0) or not np.any(x > 0.0):
         return False
     ups, downs = (np.count_nonzero(sign * np.diff(x) > 0.0) for sign in (1.0, -1.0))
     return bool(ups <= 2 * downs)

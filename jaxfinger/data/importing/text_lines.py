@@ -25,7 +25,7 @@ _LABELLED = re.compile(  # a label, a number and perhaps its unit
     re.IGNORECASE,
 )
 COMMENTS = ("#", "%")
-MAX_QUOTED = 40  # characters of a line
+MAX_QUOTED = 40  # characters of a line that a message quotes: enough to find it, and a terminal's half line
 _LIST_IN_QUOTES = re.compile(r'"\[[^"\]]*\]"')  # pandas breaks the lines of a long array
 
 
@@ -74,11 +74,11 @@ def refuse_others(path: Path, usual: str, others: Sequence[Line]) -> None:
         UserError: they are too many to be faults of single lines.
     """
     if len(others) >= _MANY:
-        first = f"the first in line {others[0].number} ({others[0].text.strip()[:MAX_QUOTED]!r})"
         raise UserError(
-            f"{path}: has {len(others)} lines among those {usual} that are of another kind, {first}, as where two "
-            "devices write into one file; give the lines of each device a file of its own (a column of a mapping may "
-            "name its `file` and `time`), or correct them if they are damaged"
+            f"{path}: line {others[0].number} ({others[0].text.strip()[:MAX_QUOTED]!r}) and {len(others) - 1} more are "
+            f"of another kind than the lines {usual}, as where two devices write into one file; give the lines of each "
+            "device a file of its own (a column of a mapping may name its `file` and `time`), or correct them if they "
+            "are damaged"
         )
 
 

@@ -19,22 +19,17 @@ def with_summed_steps(recording: Recording) -> Recording:
 
     The first step, from a sample that was not recorded, may be missing.
     """
-    variables, unusable = dict(recording.variables), dict(recording.unusable)
-    if any(is_clock(name, v.values, v.units) for name, v in variables.items()):
-        return recording
+    variables = recording.variables
     count = max((len(v.values) for v in variables.values()), default=0)
-    for name, variable in recording.variables.items():
-        steps = variable.values
-        if len(steps) < count or not is_time_step(name, steps):
-            continue
-        if lost := int(np.count_nonzero(~np.isfinite(steps[1:]))):
-            said = f"has no sum, since {counted(lost, 'step')} of time cannot be read"
-            unusable[name + _SUM] = f"{said}; fill in what is missing"
-        else:
-            unit = variable.units or spelt(name)
-            variables[name + _SUM] = replace(variable, values=np.cumsum(np.nan_to_num(steps)), units=unit)
-        break
-    return replace(recording, variables=variables, unusable=unusable)
+    name = next((n for n, v in variables.items() if len(v.values) == count and is_time_step(n, v.values)), "")
+    if not name or any(is_clock(n, v.values, v.units) for n, v in variables.items()):
+        return recording
+    steps = variables[name].values
+    if lost := int(np.count_nonzero(~np.isfinite(steps[1:]))):
+        said = f"has no sum, since {counted(lost, 'step')} of time cannot be read; fill in what is missing"
+        return replace(recording, unusable={**recording.unusable, name + _SUM: said})
+    clock = replace(variables[name], values=np.cumsum(np.nan_to_num(steps)), units=variables[name].units or spelt(name))
+    return replace(recording, variables={**variables, name + _SUM: clock})
 
 
 def steps_of(recording: Recording, clock: str) -> str:
