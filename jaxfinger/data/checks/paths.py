@@ -76,8 +76,8 @@ def _of_id2(
     laws = [kinematic.polynomials.get((tendon, i)) for i in joints]
     if not joints or any(law is None for law in laws):
         return None
-    within = [(law, q[:, i].clip(*law.domain)) for law, i in zip(laws, joints, strict=True) if law is not None]
-    return np.sum([law(angle) for law, angle in within], axis=0)
+    known = [(law, q[:, i]) for law, i in zip(laws, joints, strict=True) if law is not None]
+    return np.sum([law(angle.clip(law.domain[0], law.domain[1])) for law, angle in known], axis=0)
 
 
 def _path(
