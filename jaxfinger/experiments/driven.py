@@ -21,6 +21,7 @@ from jaxfinger.data import (
 )
 from jaxfinger.data.signals.motion import from_the_start, quick_cutoff, rest_speed, speed_noise, stretches_of
 from jaxfinger.data.signals.noise import STD_PER_MAD
+from jaxfinger.data.signals.quantiles import medians, quantiles
 from jaxfinger.experiments.reduction import Joints, PreparedTrial, Reversals, Row, joints, row
 from jaxfinger.experiments.shrink import shrink
 from jaxfinger.experiments.table import highest_cutoff
@@ -134,7 +135,7 @@ def beside_reversals(
         return None, direction
     # The filter of a fit would move the turning point between two speeds towards the slower one.
     q = low_pass(r.trial.time, r.trial.q, r.experiment.cutoff_at(r.step, sharp=True))
-    travel = REVERSAL_TRAVEL * np.median(np.abs(r.trial.q - q), axis=0)
+    travel = REVERSAL_TRAVEL * medians(np.abs(r.trial.q - q))
     sure = directions(slow, rest_speed(slow, r.quick_rates))
     at_once, later = (directions_from_turning_points(sure, q, d) for d in (0.0 * travel, travel))
     earlier = -directions_from_turning_points(-from_the_start(sure)[::-1], q[::-1], travel)[::-1]  # back in time
@@ -173,7 +174,7 @@ def tendon_directions(r: PreparedTrial, rates) -> Float[np.ndarray, "N n"]:
         return np.zeros((len(r.trial.time), r.finger.n))
     slow, quick = rates
     # The direction is needed, too, where sliding is not certain: it holds on down to a tenth of that speed.
-    noise, speed = speed_noise(slow, quick), np.percentile(np.abs(slow), 95, axis=0)
+    noise, speed = speed_noise(slow, quick), quantiles(np.abs(slow), 0.95)
     return directions(slow, np.minimum(0.1 * MIN_TENDON_SPEED_TO_NOISE * noise, 0.1 * speed))
 
 
@@ -190,8 +191,8 @@ def sliding(
     None where all are slack or unmeasured.
     """
     qd = j.qd
-    lost, fast = np.abs(r.quick_rates - slow), np.percentile(np.abs(qd), 95, axis=0)
-    noise = np.median(lost, axis=0)
+    lost, fast = np.abs(r.quick_rates - slow), quantiles(np.abs(qd), 0.95)
+    noise = medians(lost)
     least = MIN_SPEED_SHARE * fast
     least = np.where(r.motorised, np.minimum(MIN_SPEED_TO_NOISE * noise, least), least)
     slides = (np.abs(qd) > least) & (np.sign(qd) == np.sign(direction))
@@ -203,7 +204,7 @@ def sliding(
             slides[:, i] &= known[:, r.finger.crosses[:, i] & r.finger.active].all(axis=1)
     if not r.experiment.stepped:
         # A slip of one joint between two stops disturbs every joint.
-        pace = np.percentile(np.abs(slow), 95, axis=0)
+        pace = quantiles(np.abs(slow), 0.95)
         most = np.maximum(MAX_LOST_SPEED_SHARE * pace, MIN_SLIP_TO_NOISE * noise)
         slides &= np.all(lost <= most + ROUNDING_SHARE * pace.max(initial=0.0), axis=1)[:, None]
     return slides

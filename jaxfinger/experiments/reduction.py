@@ -24,7 +24,7 @@ from jaxfinger.data import (
 )
 from jaxfinger.data.predictions import predicted_at
 from jaxfinger.data.signals.motion import quick_cutoff
-from jaxfinger.data.signals.quantiles import median
+from jaxfinger.data.signals.quantiles import median, medians, quantiles
 from jaxfinger.data.signals.sizes import Sizes
 from jaxfinger.effects.drive import NOMINAL_TEMPERATURE
 from jaxfinger.experiments.table import Experiment
@@ -94,7 +94,7 @@ class PreparedTrial:
         """
         if not self.experiment.held:
             return np.zeros_like(tension) if self.experiment.slack else tension
-        return np.where(np.percentile(tension, 95, axis=0) < self.sizes.slack, 0.0, tension)
+        return np.where(quantiles(tension, 0.95) < self.sizes.slack, 0.0, tension)
 
 
 class Reversals(NamedTuple):
@@ -189,7 +189,7 @@ def joints(r: PreparedTrial, sharp: bool) -> Joints:
     """
     cutoff = r.experiment.cutoff_at(r.step, sharp)
     q, qd, qdd = smooth(r.trial.time, r.trial.q, cutoff)
-    return Joints(q, qd, qdd, np.median(np.abs(r.trial.q - q), axis=0), cutoff)
+    return Joints(q, qd, qdd, medians(np.abs(r.trial.q - q)), cutoff)
 
 
 def row(

@@ -114,9 +114,10 @@ def _angles(trial: Trial, finger: FingerDescription, report: Report) -> None:
     place = trial.place("q")
     columns = zip(finger.joint_names, trial.q.T, finger.limits, finger.prismatic, strict=True)
     for name, q, limits, slides in columns:
-        if slides or not np.isfinite(q).all():
+        if slides or not np.isfinite(q).all() or near_limits(q.min(), q.max(), limits):
             continue
-        measured = q[q != placeholder(q)]
+        missing = placeholder(q)
+        measured = q if missing is None else q[q != missing]
         low, high = quantile(measured, 0.01), quantile(measured, 0.99)
         where = f"column {name} runs from {low:.3g} to {high:.3g} rad"
         its_limits = f"its limits {limits[0]:.3g} to {limits[1]:.3g}"

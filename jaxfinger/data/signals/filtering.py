@@ -137,22 +137,22 @@ def _derivatives(
 
     They are taken at the N = C - 5 samples, or at `at`, counted in samples. The coefficients are those of `_spline`.
     """
-    last = coefficients.shape[1] - 6
-    before = None if at is None else np.clip(np.floor(at).astype(int), 0, last)
-    away = np.zeros(1) if at is None else at - before
+    if at is None:
+        return np.array([[np.correlate(c, _B_SPLINE[k], "valid") for c in coefficients] for k in orders])
+    before = np.clip(np.floor(at).astype(int), 0, coefficients.shape[1] - 6)
+    away = at - before
     # At `away` past a sample derivative k is its Taylor series Σ_j s⁽ᵏ⁺ʲ⁾ awayʲ/j!. Every s⁽ᵏ⁺ʲ⁾ is a weighted sum of
     # six coefficients, and so is the derivative.
     powers = np.ones((6, len(away)))  # awayʲ/j!
     for j in range(1, 6):
         powers[j] = powers[j - 1] * away / j
     weights = [_B_SPLINE[k:].T @ powers[: 6 - k] for k in orders]
-    out = np.zeros((len(orders), len(coefficients), last + 1 if at is None else len(at)))
-    for i in range(6):
-        near = coefficients[:, i : i + last + 1]
-        near = near if before is None else near.take(before, axis=1)
-        for derivative, weight in zip(out, weights, strict=True):
-            if weight[i].any():
-                derivative += weight[i] * near
+    out, part = np.zeros((len(orders), len(coefficients), len(at))), np.empty(len(at))
+    for column, derivatives in zip(coefficients, np.moveaxis(out, 1, 0), strict=True):  # one at a time fits the cache
+        for i in range(6):
+            near = column[i:].take(before)
+            for derivative, weight in zip(derivatives, weights, strict=True):
+                derivative += np.multiply(weight[i], near, out=part)
     return out
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxfinger.data.session import FingerDescription, Trial
 from jaxfinger.data.signals.filtering import smooth_rate
-from jaxfinger.data.signals.quantiles import median
+from jaxfinger.data.signals.quantiles import median, medians, quantiles
 from jaxfinger.data.signals.sizes import Sizes
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def quick_cutoff(cutoff_hz: float, step: float) -> float:
 
 def speed_noise(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
     """Noise of a speed: the median of its absolute change between a slower and a quicker filter."""
-    return np.median(np.abs(quick - slow), axis=0)
+    return medians(np.abs(quick - slow))
 
 
 def rest_speed(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
@@ -65,7 +65,7 @@ def rest_speed(slow: Float[np.ndarray, "N k"], quick: Float[np.ndarray, "N k"]) 
 
     `slow` and `quick` are its speed in two filters (`quick_cutoff`).
     """
-    pace = np.percentile(np.abs(slow), 95, axis=0)
+    pace = quantiles(np.abs(slow), 0.95)
     return np.clip(REST_SPEED_NOISE * speed_noise(slow, quick), *(share * pace for share in REST_SPEED_SHARES))
 
 

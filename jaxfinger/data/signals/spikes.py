@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfinger.data.signals.noise import resolution, robust_std
+from jaxfinger.data.signals.noise import STD_PER_MAD, resolution
 from jaxfinger.data.signals.quantiles import median
 
 if TYPE_CHECKING:
@@ -74,8 +74,9 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
 
 def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
     """Mark the spikes of one finite column (`outlier_mask`)."""
-    # Second differences show the noise in motion and at rest. Their variance is 6 σ².
-    noise = max(robust_std(np.diff(values, 2)) / np.sqrt(6.0), resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
+    # Second differences show the noise in motion and at rest. Their mean is about zero, their variance 6 σ².
+    noise = STD_PER_MAD * median(np.abs(np.diff(values, 2))) / np.sqrt(6.0)
+    noise = max(noise, resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
     spikes, least = np.zeros(len(values), bool), threshold * noise
     sound = values
     for _ in range(_MAX_PASSES):  # A spike bends the lines beside it, so its neighbours are judged again without it.

@@ -52,7 +52,9 @@ def placeholder(x: Float[np.ndarray, " N"]) -> float | None:
     if len(x) < _MIN_SAMPLES or not np.isfinite(x).all():
         return None
     for end in (x.min(), x.max()):
-        others = x[x != end]
-        if 1 < len(x) - len(others) < 0.5 * len(x) and np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
-            return float(end)
+        is_other = x != end
+        if 1 < len(x) - np.count_nonzero(is_other) < 0.5 * len(x):
+            others = x[is_other]
+            if np.abs(others - end).min() > 2.0 * np.ptp(others) > 0.0:
+                return float(end)
     return None

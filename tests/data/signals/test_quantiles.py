@@ -16,9 +16,23 @@ def test_they_are_those_of_numpy(size, coarse):
         assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14, abs=1e-300)
 
 
+@pytest.mark.parametrize("shape", ["constant", "two values", "drift", "in step with the sample"])
+def test_they_are_those_of_numpy_for_uneven_values(shape):
+    n = np.arange(54_872)  # 38³: every 38th value is drawn
+    values = {
+        "constant": np.ones(n.size),
+        "two values": (n % 3 == 0).astype(float),
+        "drift": np.sin(n / 9000.0),
+        "in step with the sample": np.where(n % 38 == 0, 100.0, n / n.size),
+    }[shape]
+    for share in (0.0, 0.01, 0.5, 0.66, 0.99, 1.0):
+        assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14, abs=1e-300)
+
+
+@pytest.mark.parametrize("size", [5, 5000])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_a_missing_value_shows(share):
-    values = np.arange(5.0)
+def test_a_missing_value_shows(share, size):
+    values = np.arange(float(size))
     values[2] = np.nan
     assert np.isnan(quantile(values, share))
 
