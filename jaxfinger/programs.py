@@ -17,12 +17,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import cache, cached_property, update_wrapper, wraps
+from functools import cache, update_wrapper, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax._src.config import persistent_cache_min_compile_time_secs
@@ -48,54 +47,47 @@ class Program:
     def __init__(self, f: Callable, options: Callable[[], dict[str, Any]]):
         update_wrapper(self, f)
         self._f, self._options = f, options
-        self._ready: dict[Any, Callable[[list], Any]] = {}
-
-    @cached_property
-    def _jitted(self):
-        return eqx.filter_jit(self._f, compiler_options=self._options())  # type: ignore[call-overload]
+        self._ready: dict[tuple[Any, tuple, bool], Callable] = {}
 
     def lower(self, *args, **named):
-        """Lower the function for arguments like these, as `equinox.filter_jit` does."""
-        return self._jitted.lower(*args, **named)
+        """Lower the function for arguments like these, as `jax.jit` does."""
+        structure, constants, arrays = _parts(args, named)
+        return self._jitted(structure, constants).lower(*arrays)
 
     def __call__(self, *args, **named):
-        if named:  # not looked up on disk
-            return self._jitted(*args, **named)
-        leaves, structure = jax.tree.flatten(args)
-        if not _are_kept() or any(isinstance(leaf, Tracer) for leaf in leaves):
-            return self._jitted(*args)
-        arrays = [leaf for leaf in leaves if _is_array(leaf)]
-        key = structure, tuple(map(_constant, leaves))
+        structure, constants, arrays = _parts(args, named)
+        key = structure, constants, _are_kept() and not any(isinstance(a, Tracer) for a in arrays)
         if key not in self._ready:
-            self._ready[key] = self._made(key, leaves, arrays)
-        return self._ready[key](arrays)
+            self._ready[key] = self._made(*key, arrays)
+        return self._ready[key](*arrays)
 
-    def _made(self, key: tuple, leaves: list, arrays: list) -> Callable[[list], Any]:
-        structure, constants = key
+    def _jitted(self, structure, constants: tuple, compiled_as: str = ""):
+        """The function of the arrays alone."""
+
+        def of_arrays(*arrays):
+            args, named = _filled(structure, constants, arrays)
+            return self._f(*args, **named)
+
+        of_arrays.__name__ = of_arrays.__qualname__ = compiled_as or self._f.__name__
+        return jax.jit(of_arrays, compiler_options=self._options())
+
+    def _made(self, structure, constants: tuple, on_disk: bool, arrays: list) -> Callable:
         nodes = list(_nodes(structure))
         said = repr([_name(self._f), _name(self._options), nodes, constants])
-        if " at 0x" in said or not all(_is_own(node[0]) for node in nodes):
-            return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
+        if not on_disk or " at 0x" in said or not all(_is_own(node[0]) for node in nodes):
+            return self._jitted(structure, constants)
         name = _digest(said)
         if (known := _loaded(name, len(arrays))) is not None:
             return known
-        return self._compiled(name, structure, leaves, arrays)
+        return self._compiled(name, structure, constants, arrays)
 
-    def _compiled(self, name: str, structure, leaves: list, arrays: list) -> Callable[[list], Any]:
+    def _compiled(self, name: str, structure, constants: tuple, arrays: list) -> Callable:
         """Lower the program, and compile it unless other arguments have led to the same one; keep both."""
-        results: Any = None
-
-        def flat(*arrays):
-            nonlocal results
-            out, results = jax.tree.flatten(self._f(*_filled(structure, leaves, arrays)))
-            return out
-
-        flat.__name__ = flat.__qualname__ = f"kept_{self._f.__name__}"
-        lowered = jax.jit(flat, compiler_options=self._options()).lower(*arrays)
-        text = lowered.as_text()
+        lowered = self._jitted(structure, constants, f"kept_{self._f.__name__}").lower(*arrays)
+        text, results = lowered.as_text(), lowered.out_tree
         if not all(target.startswith("lapack_") for target in re.findall(r"custom_call @(\w+)", text)):
             # JAX may ready what is called only where it traces; where it is not ready, the loaded program would crash.
-            return lambda arrays: self._jitted(*_filled(structure, leaves, arrays))
+            return self._jitted(structure, constants)
         # The text lacks arguments that the function ignores, and the program checks their shapes, too.
         code = _digest(text + repr([_constant(a) for a in arrays]))
         _write(name, pickle.dumps((code, jax.tree.unflatten(results, [0] * results.num_leaves))))
@@ -106,7 +98,7 @@ class Program:
             compiled = lowered.compile()
         with suppress(ValueError, NotImplementedError, jax.errors.JaxRuntimeError):  # a program that cannot be saved
             _write(code, serialize(compiled)[0])
-        return lambda arrays: jax.tree.unflatten(results, compiled(*arrays))
+        return compiled
 
 
 def kept(f: Callable[..., Result]) -> Callable[..., Result]:
@@ -128,17 +120,15 @@ def kept(f: Callable[..., Result]) -> Callable[..., Result]:
     return recalled
 
 
-def _loaded(name: str, arrays: int) -> Callable[[list], Any] | None:
+def _loaded(name: str, arrays: int) -> Callable | None:
     """The program of that name, which takes so many arrays; None where there is none, or a damaged one."""
     prepare_lapack_call("gesdd_ffi", np.dtype(float))  # JAX does so where it traces a call of LAPACK
     try:
         code, results = pickle.loads(_read(name))
         results = jax.tree.structure(results)
-        takes, returns = (jax.tree.structure(tree) for tree in (((0,) * arrays, {}), [0] * results.num_leaves))
-        compiled = deserialize_and_load(_read(code), takes, returns)
+        return deserialize_and_load(_read(code), jax.tree.structure(((0,) * arrays, {})), results)
     except Exception:  # A damaged file raises exceptions of many kinds.
         return None
-    return lambda arrays: jax.tree.unflatten(results, compiled(*arrays))
 
 
 def _read(name: str) -> bytes:
@@ -180,19 +170,32 @@ def _name(f: Callable) -> str:
     return f"{f.__module__}.{f.__qualname__}"
 
 
-def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray)
+class Form(NamedTuple):
+    """What a program depends on of an array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    weak_type: bool
 
 
 def _constant(leaf: Any) -> Any:
-    """What a program depends on of a leaf: all of it, but of an array its shape and type alone."""
-    return (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)) if _is_array(leaf) else leaf
+    """What a program depends on of a leaf: all of it, but of an array its form alone."""
+    if not isinstance(leaf, jax.Array | np.ndarray):
+        return leaf
+    return Form(leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False))
 
 
-def _filled(structure, leaves: list, arrays) -> Any:
-    """Arguments of that structure, with new arrays."""
+def _parts(args: tuple, named: dict) -> tuple[Any, tuple, list]:
+    """Structure of the arguments, what a program depends on of each leaf, and the arrays among the leaves."""
+    leaves, structure = jax.tree.flatten((args, named))
+    constants = tuple(map(_constant, leaves))
+    return structure, constants, [a for a, x in zip(leaves, constants, strict=True) if isinstance(x, Form)]
+
+
+def _filled(structure, constants: tuple, arrays) -> tuple[tuple, dict]:
+    """Arguments and named ones of that structure, with new arrays."""
     new = iter(arrays)
-    return jax.tree.unflatten(structure, [next(new) if _is_array(leaf) else leaf for leaf in leaves])
+    return jax.tree.unflatten(structure, [next(new) if isinstance(x, Form) else x for x in constants])
 
 
 def _nodes(structure) -> Iterator[tuple[type | None, Any, int]]:
