@@ -23,17 +23,17 @@ inexact form of its law may leave, and K_u that of what unknown causes leave. Fr
 3. Lower bounds of v_c. Noise alone leaves up to φ_c = φ max(1, (ν + o_c) / (ν + m_c)): its colour is known from a few
    repeats, and its size is at least the one seen outside of the features. Inexact laws leave up to ρ² E_c / K_c.
 
-4. Outside of the features. The excess o_c − m_c counts as if it came from ν independent samples, as in Student's
-   distribution: the size of the noise is known to one part in √ν, and misfits there come in bursts. Together
+4. Outside of the features. Less energy there than noise leaves on average, m_c, counts as in noise of known size. The
+   excess o_c − m_c counts as if it came from ν independent samples, as in Student's distribution: the size of the noise
+   is known to one part in √ν, and misfits there come in bursts. Together
 
-       log L = −½ Σ_c [ K_c log v_c + e_c / v_c + ν log(1 + max(o_c − m_c, 0) / ν) ],                             (L)
+       log L = −½ Σ_c [ K_c log v_c + e_c / v_c + min(o_c − m_c, 0) + ν log(1 + max(o_c − m_c, 0) / ν) ],         (L)
        v_c   = max(e_c / K_c, φ_c, ρ² E_c / K_c).
 
 5. Amplitudes. The unit of an amplitude a changes the prediction by as much as the nominal model misses in all, and its
    prior is N(0, 1). Nominal parameters θ are refitted with every set, under their own prior. The maximum is found by
    iteratively reweighted least squares: −2 ∂log L/∂e_c = 1 / v_c weighs the features, and
-   −2 ∂log L/∂o_c = 1 / (1 + max(o_c − m_c, 0) / ν) all other directions, the bounds of step 3 held fixed. Where
-   o_c < m_c, (L) is flat in o_c; there these directions keep the weight 1 of noise.
+   −2 ∂log L/∂o_c = 1 / (1 + max(o_c − m_c, 0) / ν) all other directions, the bounds of step 3 held fixed.
 
 6. Evidence. Laplace's approximation, with G the information on the amplitudes once θ is refitted, gives
 
@@ -109,8 +109,9 @@ def log_likelihood(
     """Terms of the log likelihood (L), one for each column, and the weights of the next least squares, of n sets."""
     K, nu = counts.K, p.outside_samples
     v = np.maximum(e / K, _variance_floor(counts, o, explained, p))
-    excess = np.maximum(o - counts.outside, 0.0) / nu
-    value = -0.5 * (K * np.log(v) + e / v + nu * np.log1p(excess))
+    beyond = o - counts.outside
+    excess = np.maximum(beyond, 0.0) / nu
+    value = -0.5 * (K * np.log(v) + e / v + np.minimum(beyond, 0.0) + nu * np.log1p(excess))
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 
