@@ -28,6 +28,13 @@ _MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
+# Ratio of the arm that excursions show to the largest that the torques of a tendon allow that was let go, too: half-way
+# between 1 and the 2 of a diameter for a radius, or of a load cell at a pulley, as ratios count.
+_MAX_SCALE = np.sqrt(2.0)
+# Shares of the highest tension: below the first a tendon is slack before it is pulled. Let go to the last, it has slid
+# back, if it loses two thirds of its tension at most: (1 − 2/3) / (1 + 2/3).
+_SLACK_SHARE, _LEAST_SHARE, _SLID_SHARE = 0.05, 0.1, 0.2
+_MIN_LET_GO = 5  # samples of a thinned trial, to tell an arm
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
@@ -66,6 +73,7 @@ def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> No
     finger = session.finger
     turned: dict[tuple[str, str], str] = {}  # by tendon and joint: what is said of them
     far: dict[tuple[str, str], str] = {}
+    scaled: dict[tuple[str, str], str] = {}
     agreed: list[tuple[str, str]] = []
     for trial in session.select("ID.4"):
         i, k = finger.joint(trial.joint), finger.tendon(trial.tendon)
@@ -84,15 +92,37 @@ def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> No
             turned[pair] = said
         elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:
             far[pair] = said
+        elif abs(seen) > _MAX_SCALE * _most_felt(trial.tendon_force[:, k], trial.joint_torque[:, i]):
+            scaled[pair] = said
         else:
             agreed.append(pair)
-    for found, what in ((turned, "the sign"), (far, "the units or the column")):
+    scale = "the scale, of which a diameter for a radius gives twice as much,"
+    for found, what in ((turned, "the sign"), (far, "the units or the column"), (scaled, scale)):
         if found:
             report.warning(
                 "/trials",
                 "moment arms that excursions show (ID.2) and those that torques show (ID.4) contradict each other: "
                 f"{listed(list(found.values()), 3)}; check {what} of {suspects(found, agreed)}",
             )
+
+
+def _most_felt(tension: np.ndarray, torque: np.ndarray) -> float:
+    """Largest moment arm, m, that the torques (N,) at a held joint allow, by a tendon's tensions (N,) in N.
+
+    While the tension rises, friction lets no more than the tension come to the joint; once the tendon slides back, no
+    less. So the torque changes by the arm or more for each N between slack and sliding back. Infinite where the tendon
+    was not slack before the pull, or was not let go.
+    """
+    f, y = thinned(tension), thinned(torque)
+    good = np.isfinite(f) & np.isfinite(y)
+    if not good.any():
+        return np.inf
+    f, y, top = f[good], y[good], float(np.max(f[good]))
+    falls = np.arange(len(f)) > np.argmax(f)
+    slack, slid = ~falls & (f < _SLACK_SHARE * top), falls & (f > _LEAST_SHARE * top) & (f < _SLID_SHARE * top)
+    if min(slack.sum(), slid.sum()) < _MIN_LET_GO:
+        return np.inf
+    return float(np.max(np.abs(y[slid] - np.median(y[slack])) / (f[slid] - np.median(f[slack]))))
 
 
 def suspects(found: Collection[tuple[str, str]], agreed: Collection[tuple[str, str]]) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.bad_input import complaints, mistakes
-from jaxfinger.data import Trial
+from jaxfinger.data import Session, Trial
 from jaxfinger.data.checks.work import suspects
 from tests.units import Scale
 
@@ -48,6 +48,51 @@ def test_what_contradicts_is_said(sound, experiment, channel, change, words):
 
     found = complaints(replace(sound, trials={t.name: wrong(t) for t in sound})) - complaints(sound)
     assert any(words in text for text in found), found
+
+
+def let_go(loss: float) -> Trial:
+    """ID.4 of T1, whose arm at MCP is 8 mm: pulled in steps and let go in steps, with a share lost to friction."""
+    steps = np.repeat([0.0, 4.0, 8.0, 12.0, 8.0, 4.0, 2.0, 0.0], 50)
+    tension = np.convolve(np.pad(steps, 10, "edge"), np.full(21, 1 / 21), "valid")
+    arrives, at = np.zeros(len(tension)), 0.0
+    for i, f in enumerate(tension):
+        at = arrives[i] = np.clip(at, f * (1.0 - loss), f * (1.0 + loss))
+    count, nothing = len(tension), np.zeros(len(tension))
+    return Trial(
+        name="05-ID.4-T1-let-go",
+        experiment="ID.4",
+        time=np.arange(count) * 0.02,
+        q=np.column_stack([np.full(count, 0.5), nothing]),
+        joint="MCP",
+        tendon="T1",
+        tendon_force=np.column_stack([tension, nothing, np.full(count, np.nan)]),
+        joint_torque=np.column_stack([0.01 - 0.008 * arrives, np.full(count, np.nan)]),
+    )
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.35, 0.66])
+def test_friction_is_no_wrong_scale_where_a_tendon_is_let_go(sound, loss):
+    assert not any("contradict" in text for text in complaints(with_trial(sound, let_go(loss))))
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.35])
+@pytest.mark.parametrize(
+    ("channel", "factor", "arms"), [("tendon_excursion", 2.0, "(16 against"), ("tendon_force", 2.0, "(8 against")]
+)
+def test_twice_the_scale_is_said_where_a_tendon_is_let_go(sound, loss, channel, factor, arms):
+    """Pulled only, a tendon that loses half of its tension would show the same torque."""
+
+    def wrong(trial: Trial) -> Trial:
+        values = getattr(trial, channel)
+        return trial if values is None else replace(trial, **{channel: factor * values})
+
+    session = with_trial(sound, let_go(loss))
+    said = complaints(replace(session, trials={t.name: wrong(t) for t in session}))
+    assert any(f"T1 at MCP {arms}" in text and "check the scale" in text for text in said), said
+
+
+def with_trial(session: Session, trial: Trial) -> Session:
+    return replace(session, trials={**session.trials, trial.name: trial})
 
 
 @pytest.mark.parametrize("size", [0.05, 1.0, 20.0])
