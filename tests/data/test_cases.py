@@ -36,7 +36,6 @@ REFUSED = [
     ("mcap-in-an-encoding-that-is-not-read", "log.mcap", "m.toml", ["/joint_states is in protobuf", "convert"]),
     ("own-clock-does-not-overlap", "log.mat", "m.toml", ["`t2` runs from 312.5", "1700000000", "do not overlap"]),
     ("own-clock-out-of-order", "log.mat", "m.toml", ["`t2` does not increase at 124 of 600", "first after sample 52"]),
-    ("simulink-signal-of-two-columns", "rows.mat", "rows.toml", ["3 rows", "joints first", "transpose"]),
     ("stamps-out-of-order-and-the-advice", "log.csv", "m.toml", ["560 of 1200", "sorted by their time", "sort = true"]),
     ("variable-that-is-there-called-absent", "complex.mat", "complex.toml", ["q is complex"]),
     ("variable-that-is-there-called-absent", "empty.mat", "empty.toml", ["tau is empty"]),
@@ -54,6 +53,7 @@ IMPORTED = [
     ("mapping-value-of-the-wrong-kind", "log.csv", "created-date.toml"),
     ("one-topic-of-an-unknown-type", "log", "m.toml"),
     ("simulink-signal-of-two-columns", "log.mat", "m.toml"),
+    ("simulink-signal-of-two-columns", "rows.mat", "rows.toml"),
 ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.importing.recording import Recording, Variable, samples_first
 from jaxfinger.data.opening import why_closed, why_unreadable
 from jaxfinger.data.schema import FORMAT
 from jaxfinger.data.units import stated_units
@@ -123,6 +123,12 @@ def named_arrays(
                 words[name] = array.astype(np.dtypes.StringDType())
         else:
             variables[name] = Variable(array, units=units.get(name) or stated_units(name))
+    variables = samples_first(variables)
+    for name, v in tuple(variables.items()):
+        if v.values.ndim == 2 and v.values.shape[1] > len(v.values):
+            rows, columns = v.values.shape
+            unusable[name] = f"has {rows} rows and {columns} columns; save it with one row a sample"
+            del variables[name]
     return Recording(path, variables, unusable, words=words)
 
 
@@ -157,8 +163,6 @@ def _array(value: Any) -> np.ndarray | Unusable:
     array = np.atleast_1d(np.squeeze(array)) if 1 in array.shape else np.atleast_1d(array)
     if array.ndim > 2:
         return Unusable(f"is an array of {' × '.join(map(str, array.shape))}; save it with one row a sample")
-    if array.ndim == 2 and array.shape[1] > array.shape[0]:
-        return Unusable(f"has {array.shape[0]} rows and {array.shape[1]} columns; save it with one row a sample")
     return array.astype(np.float64)
 
 

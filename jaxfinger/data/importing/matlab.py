@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -14,7 +15,7 @@ import scipy.io
 import scipy.sparse
 from scipy.io.matlab import MatlabOpaque, varmats_from_mat
 
-from jaxfinger.data.importing.recording import Recording, Variable
+from jaxfinger.data.importing.recording import Recording, Variable, samples_first
 from jaxfinger.data.opening import why_closed, why_unreadable
 from jaxfinger.data.probe import restart_timer, survives
 from jaxfinger.errors import UserError
@@ -39,7 +40,8 @@ class _Unusable(str):
 
 
 def load_mat(path: Path) -> Recording:
-    """Load every numeric variable, samples first. Members of structures are named `outer.inner`.
+    """Load every numeric variable, samples first. Members of structures are named `outer.inner`, and those of a
+    list of structures `outer(1).inner`, as MATLAB counts.
 
     The clock of a signal in a Simulink structure with time (`S.time` beside `S.signals`) is `S.time`.
 
@@ -53,10 +55,11 @@ def load_mat(path: Path) -> Recording:
         if isinstance(value, _Unusable):
             unusable[name] = str(value)
             continue
-        outer = name.split(".signals.")[0]
-        clock = f"{outer}.time" if ".signals." in name else ""
+        outer, signals, _ = re.split(r"(\.signals(?:\(\d+\))?\.)|$", name, maxsplit=1)
+        clock = f"{outer}.time" if signals else ""
         variables[name] = Variable(_samples_first(value), clock=clock)
-    return Recording(path, {name: _on_clock(v, variables) for name, v in variables.items()}, unusable)
+    on_clocks = {name: _on_clock(v, variables) for name, v in variables.items()}
+    return Recording(path, samples_first(on_clocks), unusable)
 
 
 def _on_clock(variable: Variable, variables: Mapping[str, Variable]) -> Variable:
@@ -122,9 +125,13 @@ def _from_hdf5(item: Any) -> Any:
     if "MATLAB_sparse" in item.attrs:
         return _Unusable("is a sparse matrix; save full(…) of it")
     if isinstance(item, h5py.Group):
+        if len(sizes := {_listed(child) for child in item.values()}) == 1 and (count := sizes.pop()):
+            return [
+                {name: _from_hdf5(item.file[child[()].T.flat[k]]) for name, child in item.items()} for k in range(count)
+            ]
         return {name: _from_hdf5(child) for name, child in item.items()}
-    if item.dtype.kind == "O":  # References are a cell array, or a member of a list of structures.
-        return _Unusable(f"is a list of {item.size} {'cells' if kind == 'cell' else 'structures'}; {_ONE}")
+    if item.dtype.kind == "O":  # References are a cell array.
+        return _Unusable(f"is a list of {item.size} cells; {_ONE}")
     if kind == "char":
         return _Unusable("is text; name a variable of numbers")
     if item.attrs.get("MATLAB_empty", 0):
@@ -133,12 +140,32 @@ def _from_hdf5(item: Any) -> Any:
     return _Unusable(reason) if reason is not None else _plain(item[()].T)
 
 
+def _listed(item: h5py.Group | h5py.Dataset) -> int:
+    """Number of structures of a list, of which this is a member: references without a class; 0 of another item."""
+    member = isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference
+    return item.size if member and "MATLAB_class" not in item.attrs else 0
+
+
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
+    for key, value in tree.items():
+        name, items = prefix + key, _structures(value)
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
+            yield from _leaves(value, f"{name}.")
+        elif items:
+            first = next(iter(items[0]), "…")
+            yield name, _Unusable(f"is a list of {len(items)} structures; name a member of one, as {name}(1).{first}")
+            for k, item in enumerate(items, 1):
+                yield from _leaves(item, f"{name}({k}).")
         else:
-            yield prefix + name, _plain(value)
+            yield name, _plain(value)
+
+
+def _structures(value: Any) -> list[Mapping[str, Any]]:
+    """Structures of a list that holds nothing else; empty for any other value."""
+    if not isinstance(value, list) and not (isinstance(value, np.ndarray) and value.dtype == object):
+        return []
+    items = np.ravel(np.array(value, object)).tolist()
+    return items if all(isinstance(item, Mapping) for item in items) else []
 
 
 def _plain(value: Any) -> Any:

@@ -53,6 +53,26 @@ class Recording:
     angles: str = ""
 
 
+def samples_first(variables: Mapping[str, Variable]) -> dict[str, Variable]:
+    """Variables of which arrays that lie joints first are turned: k×N, where k < N, beside a vector of N samples.
+
+    Beside an array `run.q` lie the members of the same structure (`run.t`), and those around it (`t`).
+    """
+    counts: dict[str, set[int]] = {}
+    for name, v in variables.items():
+        if v.values.ndim == 1:
+            counts.setdefault(name.rpartition(".")[0], set()).add(len(v.values))
+
+    def turned(name: str, v: Variable) -> bool:
+        if v.values.ndim != 2 or len(v.values) >= v.values.shape[1]:
+            return False
+        parts = name.split(".")[:-1]
+        around = [".".join(parts[:k]) for k in range(len(parts) + 1)]
+        return any(v.values.shape[1] in counts.get(scope, ()) for scope in around)
+
+    return {name: replace(v, values=v.values.T) if turned(name, v) else v for name, v in variables.items()}
+
+
 def side_by_side(recordings: Sequence[Recording]) -> Recording:
     """Recordings of the same samples, as of loggers that write each array to a file of its own, as one recording.
 

@@ -154,3 +154,11 @@ def test_units_are_read_where_hdf5_and_json_state_them(tmp_path):
     found = written(tmp_path / "log.json", json.dumps(content)).variables
     units = {name: variable.units for name, variable in found.items()}
     assert units == {"angle.values": "deg", "run.tau": "N mm", "run.t": "", "force [mN]": "mN"}
+
+
+def test_arrays_with_joints_first_are_read_beside_their_clock(tmp_path):
+    q, path = np.arange(12.0).reshape(2, 6), tmp_path / "log.npz"
+    np.savez(path, t=np.arange(6.0), q=q, other=np.ones((2, 7)))
+    found = load_recording(path)
+    np.testing.assert_array_equal(found.variables["q"].values, q.T)
+    assert found.unusable["other"] == "has 2 rows and 7 columns; save it with one row a sample"

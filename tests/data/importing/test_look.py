@@ -446,7 +446,8 @@ def test_messages_that_ros2_topic_echo_wrote_are_proposed_and_imported(tmp_path,
 
 
 def test_arrays_with_joints_first_are_named(tmp_path):
-    scipy.io.savemat(tmp_path / "log.mat", {"t": TIME, "q": np.stack([SWEEP, SWEEP])})
+    """The times lie in another structure, so that nothing beside the array says which way it lies."""
+    scipy.io.savemat(tmp_path / "log.mat", {"clock": {"t": TIME}, "q": np.stack([SWEEP, SWEEP])})
     assert '# "q" is 2 by 400, joints first: transpose it, and save it again' in proposal(
         [load_recording(tmp_path / "log.mat")]
     )
