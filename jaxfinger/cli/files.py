@@ -214,11 +214,12 @@ def import_(
     refuse_output(output, overwrite, mapping, *sources)
     from jaxfinger.data.findings import Report
     from jaxfinger.data.importing.by_mapping import import_file
+    from jaxfinger.data.importing.recording import told_apart
 
     report = Report()
     try:
         with progress("import") as say:
-            say(", ".join(s.name for s in sources))
+            say(", ".join(told_apart(sources)))
             session = import_file(sources, mapping, output, overwrite, report)
     finally:
         print_warnings(report, mapping)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from jaxfinger.data.importing.logs import Log
 from jaxfinger.data.importing.recording import Recording
 from jaxfinger.data.importing.survey import ColumnSurvey, values_of
 from jaxfinger.data.units import TO_SI
@@ -18,7 +20,7 @@ _MIN_TENSION_CHANGE = 0.5  # of the highest tension: larger where tendons drive 
 
 
 def guessed_experiment(
-    recording: Recording, channels: Mapping[str, Sequence[ColumnSurvey]], names: Mapping[str, Sequence[str]]
+    log: Log, channels: Mapping[str, Sequence[ColumnSurvey]], names: Mapping[str, Sequence[str]]
 ) -> tuple[str, str, str]:
     """Guess experiment, joint and tendon (empty where there is none) from what moves.
 
@@ -41,12 +43,12 @@ def guessed_experiment(
     if q and not moved:  # The joints are held, and a tendon is pulled.
         if not torque and channels.get("fingertip_force"):
             return "VD.2", "", tendon
-        stem = recording.path.stem.lower()
+        stem = str(Path(log.file).with_suffix("")).lower()
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
     if torque or not moved or not (force or excursion):  # A motor moves a joint, or several do, each with its torque.
         joint = joint if len(moved) <= 1 or len(torque) == 1 else ""
-        return ("ID.3-static" if moved and _stepped(recording, q[most]) else "ID.3-dynamic"), joint, ""
+        return ("ID.3-static" if moved and _stepped(log.recording, q[most]) else "ID.3-dynamic"), joint, ""
     if len(moved) == 1:
         return "ID.2", joint, ""
     # Several joints are moved, by hand or by the tendons.

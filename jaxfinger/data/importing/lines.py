@@ -33,7 +33,7 @@ def column_line(seen: ColumnSurvey, log: Log | None, slides: bool, turns: bool) 
     if seen.column is not None:
         parts.append(f"column = {quoted(seen.column) if isinstance(seen.column, str) else seen.column}")
     if log is not None:
-        parts.append(f"file = {quoted(log.recording.path.name)}")
+        parts.append(f"file = {quoted(log.file)}")
         if log.clock is not None:
             units = _units_of_clock(log.clock)
             parts.append(f"time = {{ from = {quoted(log.clock.name)}{units} }}")
@@ -172,7 +172,7 @@ def elsewhere_lines(log: Log) -> list[str]:
         return []
     return [
         "# it holds no angles, and no log that does shares its times. If it belongs to another trial, and its clock",
-        f"# began elsewhere, write its columns there, each with file = {quoted(log.recording.path.name)} and time =",
+        f"# began elsewhere, write its columns there, each with file = {quoted(log.file)} and time =",
         f"# {{ from = {quoted(log.clock.name)}, offset = … }}, what is to be added to its times for those of the trial",
     ]
 

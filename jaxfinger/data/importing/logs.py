@@ -23,10 +23,11 @@ _MIN_REPEATED = 0.9  # of the samples with the stamp of the one before: with its
 
 @dataclass(frozen=True)
 class Log:
-    """A recording and the survey of its columns."""
+    """A recording, the survey of its columns, and the name by which a mapping reads its file."""
 
     recording: Recording
     seen: list[ColumnSurvey]
+    file: str
 
     @property
     def clock(self) -> ColumnSurvey | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from jaxfinger.data.importing.lines import (
 )
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import MOTOR, is_nameless, is_set_point, words
-from jaxfinger.data.importing.recording import Recording
+from jaxfinger.data.importing.recording import Recording, told_apart
 from jaxfinger.data.importing.stamps import coarse_rate, restarts
 from jaxfinger.data.importing.survey import ColumnSurvey, weight_on_reach
 from jaxfinger.data.importing.time_steps import steps_of
@@ -51,7 +52,8 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
     recordings map alike are shared. `head` holds the lines of specimen and finger.
     """
     weight = weight_on_reach(finger)
-    trials = trials_of([Log(*pair) for pair in zip(recordings, surveyed(recordings, finger), strict=True)])
+    files = told_apart([recording.path for recording in recordings])
+    trials = trials_of([Log(*of) for of in zip(recordings, surveyed(recordings, finger), files, strict=True)])
     proposed = [_trial_proposal(logs, finger, weight) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
@@ -64,10 +66,10 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
     for number, (logs, trial) in enumerate(zip(trials, proposed, strict=True), 1):
-        recording = logs[0].recording
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", recording.path.stem).strip("-") or "log"
+        file = logs[0].file
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", str(Path(file).with_suffix(""))).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
-        lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(recording.path.name)}", *trial.lines]
+        lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(file)}", *trial.lines]
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
@@ -86,7 +88,7 @@ def _side_by_side(logs: Sequence[Log]) -> list[str]:
     """A comment for logs with as many samples as one without a clock: each may hold an array of one recording."""
     lines = []
     for count in dict.fromkeys(log.count for log in logs if log.clock is None):
-        names = [quoted(log.recording.path.name) for log in logs if log.count == count]
+        names = [quoted(log.file) for log in logs if log.count == count]
         if len(names) > 1 and count > _MAX_TABLE:
             lines += [
                 "",
@@ -119,7 +121,7 @@ def _trial_proposal(logs: Sequence[Log], finger: FingerDescription | None, weigh
         channels["q"] = [s for s in channels["q"] if not _has(_MOTOR_BESIDE_LINK, s)]
     rivals = _choose_families(channels, finger)
     names, surplus = _assign(channels, finger)
-    experiment, joint, tendon = guessed_experiment(recording, channels, names)
+    experiment, joint, tendon = guessed_experiment(logs[0], channels, names)
     torques = channels.get("joint_torque", ())
     if joint and len(torques) == 1 and not any(held_names(torques, known_names("joint_torque", finger))):
         names["joint_torque"] = [joint]  # A single torque sensor belongs to the joint that the motor moves.

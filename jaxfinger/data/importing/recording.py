@@ -53,6 +53,18 @@ class Recording:
     angles: str = ""
 
 
+def told_apart(paths: Sequence[Path]) -> list[str]:
+    """Names of files, each with as much of its folder as tells it apart from the others."""
+    all_parts = {path.parts for path in paths}
+
+    def name(parts: tuple[str, ...]) -> str:
+        ends = (parts[-k:] for k in range(1, len(parts) + 1))
+        alone = (end for end in ends if sum(other[-len(end) :] == end for other in all_parts) == 1)
+        return Path(*next(alone, parts)).as_posix()
+
+    return [name(path.parts) for path in paths]
+
+
 def samples_first(variables: Mapping[str, Variable]) -> dict[str, Variable]:
     """Variables of which arrays that lie joints first are turned: k×N, where k < N, beside a vector of N samples.
 

@@ -480,3 +480,23 @@ def test_a_clock_that_wraps_after_its_bits_is_unwrapped(tmp_path, bits, unwraps)
     said = proposal([load_recording(tmp_path / "log.csv")])
     assert (f'time = {{ from = "t_ms", units = "ms", unwrap = {2**bits} }}' in said) == unwraps
     assert ("the time begins again" in said) != unwraps
+
+
+def test_recordings_of_one_name_in_folders_of_their_own_are_told_apart(tmp_path, capsys):
+    """A folder a trial is a usual order. What is proposed imports as it stands, and names trials by their folders."""
+    runs = {"bend": 1.0, "stretch": 0.5}
+    for name, size in runs.items():
+        (tmp_path / name).mkdir()
+        table = np.column_stack([TIME, size * SWEEP, 0.01 * SWEEP])
+        np.savetxt(tmp_path / name / "log.csv", table, "%.6f", ",", header="t [s],q [rad],tau [N m]", comments="")
+    files = [str(tmp_path / name / "log.csv") for name in runs]
+    (tmp_path / "finger.toml").write_text(ONE_JOINT[ONE_JOINT.index("[finger]") :])
+    main(["look", *files, "--finger", str(tmp_path / "finger.toml")])
+    said, mapping = capsys.readouterr().out, tmp_path / "map.toml"
+    mapping.write_text(said[said.index("# a mapping") :])
+    main(["import", *files, "--mapping", str(mapping), "--output", str(tmp_path / "s.h5")])
+    assert "import: bend/log.csv, stretch/log.csv" in capsys.readouterr().err
+    session = read_session(tmp_path / "s.h5")
+    for trial, (name, size) in zip(session, runs.items(), strict=True):
+        assert name in trial.name
+        assert np.ptp(trial.q) == pytest.approx(size * np.ptp(SWEEP), rel=0.01)
