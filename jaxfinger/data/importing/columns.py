@@ -337,8 +337,11 @@ class ColumnReader:
         if (lost := gaps(steps)).any():
             count = f"{counted(int(lost.sum()), 'gap')}, the longest {float(steps.max()):.3g} s"
             self.report.warning(where.key, f"the clock {name} has {count}; values in gaps are interpolated")
-        if max(time[0] - trial[0], trial[-1] - time[-1]) > 2.0 * step:
-            self.report.warning(where.key, f"{runs}; the trial is cut to what both cover")
+        ends = {"begins {:.3g} s after": time[0] - trial[0], "ends {:.3g} s before": trial[-1] - time[-1]}
+        if max(ends.values()) > 2.0 * step:
+            # In s since 1970 both would read the same.
+            said = " and ".join(end.format(lost) for end, lost in ends.items() if lost > 0.0)
+            self.report.warning(where.key, f"the clock {name} {said} the trial; the trial is cut to what both cover")
 
     @property
     def covered(self) -> np.ndarray:

@@ -142,8 +142,9 @@ def _from_hdf5(item: Any) -> Any:
 
 def _listed(item: h5py.Group | h5py.Dataset) -> int:
     """Number of structures of a list, of which this is a member: references without a class; 0 of another item."""
-    member = isinstance(item, h5py.Dataset) and h5py.check_ref_dtype(item.dtype) is h5py.Reference
-    return item.size if member and "MATLAB_class" not in item.attrs else 0
+    if isinstance(item, h5py.Group) or "MATLAB_class" in item.attrs:
+        return 0
+    return int(item.size or 0) if h5py.check_ref_dtype(item.dtype) is h5py.Reference else 0
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

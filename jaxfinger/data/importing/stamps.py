@@ -11,6 +11,7 @@ from jaxfinger.errors import counted
 # A stamp that is late is so by less than this, in s and in samples, since loggers write more often; and one that runs
 # back between two longer runs of samples begins another recording, or wraps.
 _MAX_LATE, _MAX_LATE_SAMPLES = 1.0, 10
+_HOUR = 3600.0  # s
 # Coarse stamps repeat regularly: as many samples to each, within one or a fifth, with room for jitter. Fewer repeated
 # stamps may be samples that were logged twice, and fewer stamps show no regularity.
 _MIN_REPEATED, _MIN_STAMPS, _MIN_REGULAR, _MAX_UNEVEN = 0.1, 10, 0.9, 0.2
@@ -58,6 +59,11 @@ def increasing_order(time: np.ndarray, name: str, sort: bool, choice: str, where
         far = f"runs back by {time[begins[0]] - time[begins[0] + 1]:.4g} s after sample {begins[0]}"
         far += f", and at {counted(len(begins), 'place')} in all" if len(begins) > 1 else ""
         wraps_after = time[begins[0]] - time[begins[0] + 1] + float(np.median(np.diff(time)))
+        if abs(wraps_after - _HOUR) < _MAX_LATE:
+            where.fail(
+                f"the clock {name} {far}, as clocks do when summer time ends: add the hour by its period in its own "
+                f"units, of s as time = {{ from = …, unwrap = {_HOUR:.0f} }}; if it begins again there, {choice}"
+            )
         where.fail(
             f"the clock {name} {far}: it begins again or wraps, and sorting would mix different times; {choice}, or "
             f"unwrap a clock that wraps after {wraps_after:.6g} s by its period in its own units, as "

@@ -90,8 +90,14 @@ def test_gaps_of_a_clock_are_said(tmp_path):
 def test_a_clock_with_a_gap_that_starts_late_is_said_to_cut_the_trial(tmp_path):
     keep = (SLOW > 0.5) & ((SLOW < 2) | (SLOW > 4))
     _, said = bring_in(tmp_path, OWN, slow=SLOW[keep], tau=0.01 * np.sin(SLOW[keep]))
-    runs = "the clock `slow` runs from 0.55 to 5.95 s, the trial from 0 to 5.99 s"
-    assert any(f"{runs}; the trial is cut to what both cover" in text for text in said)
+    ends = "the clock `slow` begins 0.55 s after and ends 0.04 s before the trial"
+    assert any(f"{ends}; the trial is cut to what both cover" in text for text in said)
+
+
+def test_how_much_a_clock_of_seconds_since_1970_cuts_is_said(tmp_path):
+    slow = (SLOW + 1.7e9)[SLOW > 0.32]
+    _, said = bring_in(tmp_path, OWN, t=TIME + 1.7e9, slow=slow, tau=0.01 * np.sin(slow))
+    assert any("the clock `slow` begins 0.35 s after and ends 0.04 s before the trial" in text for text in said)
 
 
 def test_samples_are_sorted_on_request(tmp_path):
@@ -112,6 +118,15 @@ def test_a_clock_that_begins_again_is_not_sorted(tmp_path, extra, period):
     said = r"`t` runs back by [\d.]+ s after sample \d+: it begins again or wraps, .* by `where`, .* unwrap = "
     with pytest.raises(UserError, match=said):
         bring_in(tmp_path, '"now"', extra, t=TIME % period)
+
+
+def test_an_hour_that_ends_summer_time_is_said_and_added(tmp_path):
+    """Times of day run back by an hour within the trial."""
+    t = 10798.0 + TIME - np.where(TIME < 2.0, 0.0, 3600.0)
+    with pytest.raises(UserError, match=r"runs back by 3600 s after sample 199, as clocks do when summer time ends"):
+        bring_in(tmp_path, '"now"', t=t)
+    trial, _ = bring_in(tmp_path, '"now"', 'time = { from = "t", unwrap = 3600 }', t=t)
+    np.testing.assert_allclose(trial.time, TIME, atol=1e-6)
 
 
 def test_a_condition_chooses_a_part_whose_clock_begins_again(tmp_path):
