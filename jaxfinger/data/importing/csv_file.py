@@ -66,8 +66,12 @@ def load_csv(path: Path) -> Recording:
     if not any(numeric):
         raise UserError(f"{path}: holds no column of numbers; give a table with one line a sample")
     first = next(i for i, line in enumerate(body) if _is_sample(dialect, split(line.text), numeric))
-    above = [line for line in lines if line.number < body[first].number]
     rows = [row for line in sample if len(row := split(line.text)) == len(numeric)]
+    # A column that is blank in the middle of the file may hold words before, as names of trials do.
+    shown = [number and _shows_numbers(dialect, cells) for number, *cells in zip(numeric, *rows, strict=True)]
+    while first > 0 and any(shown) and _is_sample(dialect, split(body[first - 1].text), shown):
+        first -= 1
+    above = [line for line in lines if line.number < body[first].number]
     blank = not any(row[-1] for row in rows)
     heads = _heads(above, dialect, len(numeric), blank)
     names, units, scope = _names(heads, dialect, len(numeric))
@@ -132,6 +136,11 @@ def _numbers_columns(dialect: Dialect, body: Sequence[Line]) -> bool:
 def _numbers(dialect: Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> list[float | None]:
     """Numbers of a line in the columns of numbers, as far as it reaches."""
     return [dialect.number(cell) for cell, number in zip(cells, numeric, strict=False) if number]
+
+
+def _shows_numbers(dialect: Dialect, cells: Sequence[str]) -> bool:
+    """Whether some cell of a column is a number, not only blank or a mark of a missing one."""
+    return any(value is not None and not np.isnan(value) for value in map(dialect.number, cells))
 
 
 def _is_sample(dialect: Dialect, cells: Sequence[str], numeric: Sequence[bool]) -> bool:

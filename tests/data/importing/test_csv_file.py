@@ -123,6 +123,22 @@ def test_numbers_of_which_most_are_spoiled_are_no_words(tmp_path):
     assert not found.words
 
 
+@pytest.mark.parametrize("blank", ["", "-", "n/c"])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_samples_with_words_are_kept_where_the_column_is_blank_later(tmp_path, blank, place):
+    """Between two trials a logger goes on without a name."""
+    rows = [[f"{k}", f"{0.5 * k}"] for k in range(400)]
+    for k, row in enumerate(rows):
+        row.insert(place, "first" if k < 100 else blank if k < 300 else "second")
+    names = ["t", "q"]
+    names.insert(place, "trial")
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(map(",".join, [names, *rows])) + "\n")
+    found = load_csv(path)
+    np.testing.assert_array_equal(found.variables["t"].values, np.arange(400.0))
+    assert [str(found.words["trial"][k]) for k in (0, 200, 399)] == ["first", blank, "second"]
+
+
 def test_a_text_column_without_a_name_is_said(tmp_path):
     assert "'idle', 'moves'" in load(tmp_path, "0,idle\n1,moves\n2,moves\n").unusable["column 1"]
 
