@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -43,7 +42,7 @@ def guessed_experiment(
     if q and not moved:  # The joints are held, and a tendon is pulled.
         if not torque and channels.get("fingertip_force"):
             return "VD.2", "", tendon
-        stem = str(Path(log.file).with_suffix("")).lower()
+        stem = log.title.lower()
         named = [name for name in names["q"] if name.lower() in stem] if len(names["q"]) > 1 else names["q"]
         return "ID.4", named[0] if len(named) == 1 else "?", tendon
     if torque or not moved or not (force or excursion):  # A motor moves a joint, or several do, each with its torque.

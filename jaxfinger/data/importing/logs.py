@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -23,11 +24,22 @@ _MIN_REPEATED = 0.9  # of the samples with the stamp of the one before: with its
 
 @dataclass(frozen=True)
 class Log:
-    """A recording, the survey of its columns, and the name by which a mapping reads its file."""
+    """A recording, the survey of its columns, and the name by which a mapping reads its file.
+
+    Of a file that holds several trials it is one of them: `part` names it, and `where` is the condition that chooses
+    it. Both are empty where it is the whole file.
+    """
 
     recording: Recording
     seen: list[ColumnSurvey]
     file: str
+    part: str = ""
+    where: str = ""
+
+    @property
+    def title(self) -> str:
+        """Words that tell it apart from others: its file without the ending, and its part."""
+        return str(Path(self.file).with_suffix("")) + (f"-{self.part}" if self.part else "")
 
     @property
     def clock(self) -> ColumnSurvey | None:

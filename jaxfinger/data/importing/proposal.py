@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from jaxfinger.data.importing.lines import (
 )
 from jaxfinger.data.importing.logs import Log, trials_of
 from jaxfinger.data.importing.names import MOTOR, is_nameless, is_set_point, words
+from jaxfinger.data.importing.parts import apart
 from jaxfinger.data.importing.recording import Recording, told_apart
 from jaxfinger.data.importing.stamps import coarse_rate, restarts
 from jaxfinger.data.importing.survey import ColumnSurvey, weight_on_reach
@@ -46,14 +46,16 @@ _HEAD = 'specimen = "my finger"\nfinger = "finger.toml"'
 def proposal(recordings: Sequence[Recording], finger: FingerDescription | None = None, head: str = _HEAD) -> str:
     """Propose a mapping (TOML) with one trial for each recording, to be corrected by someone who knows the rig.
 
-    A recording without angles, such as the log of a torque sensor alone, belongs to the trial of the recording with
-    angles that was made at the same time. Columns are assigned to the finger's joints and tendons by name, or in order
-    where names do not match. Without a finger, joints and tendons are named as in the recordings. Channels that all
-    recordings map alike are shared. `head` holds the lines of specimen and finger.
+    A recording in which words tell several trials apart makes one of each. One without angles, such as the log of a
+    torque sensor alone, belongs to the trial of the recording with angles that was made at the same time. Columns are
+    assigned to the finger's joints and tendons by name, or in order where names do not match. Without a finger, joints
+    and tendons are named as in the recordings. Channels that all recordings map alike are shared. `head` holds the
+    lines of specimen and finger.
     """
     weight = weight_on_reach(finger)
     files = told_apart([recording.path for recording in recordings])
-    trials = trials_of([Log(*of) for of in zip(recordings, surveyed(recordings, finger), files, strict=True)])
+    whole = [Log(*of) for of in zip(recordings, surveyed(recordings, finger), files, strict=True)]
+    trials = trials_of(apart(whole, finger))
     proposed = [_trial_proposal(logs, finger, weight) for logs in trials]
     channels = {channel: None for trial in proposed for channel in trial.channels}
     shared = {}
@@ -66,10 +68,11 @@ def proposal(recordings: Sequence[Recording], finger: FingerDescription | None =
         lines += ["", "[channels]   # of all trials"]
         lines += [f"{channel}.{as_key(name)} = {said}" for channel, rows in shared.items() for name, said in rows]
     for number, (logs, trial) in enumerate(zip(trials, proposed, strict=True), 1):
-        file = logs[0].file
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", str(Path(file).with_suffix(""))).strip("-") or "log"
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "-", logs[0].title).strip("-") or "log"
         stem = stem if re.match(r"\d", stem) else f"{number:02}-{stem}"
-        lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(file)}", *trial.lines]
+        lines += ["", f"[trials.{as_key(stem)}]", f"file = {quoted(logs[0].file)}"]
+        lines += [f"where = {quoted(logs[0].where)}"] if logs[0].where else []
+        lines += trial.lines
         for channel, rows in trial.channels.items():
             if channel not in shared:
                 lines += [f"channels.{channel}.{as_key(name)} = {said}" for name, said in rows]
