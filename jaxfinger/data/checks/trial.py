@@ -18,6 +18,7 @@ from jaxfinger.errors import counted, listed
 _SEVERAL_PULL = ("VD.2", "VD.3")  # experiments with the tension of several tendons at once
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
+_MAX_UNLIKE = 0.05  # of a joint's travel, by which the angle of another follows it: sensors agree to a few percent
 
 
 def check_trial(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
@@ -181,6 +182,16 @@ def _spans(trial: Trial) -> np.ndarray:
     return np.array([_span(column) for column in trial.q.T])
 
 
+def _followers(q: np.ndarray, moved: int, finger: FingerDescription) -> list[str]:
+    """Names of the joints behind the `moved` one whose angles (N, m) are its own but for a constant."""
+    x, turns = q[:, moved], not finger.prismatic[moved]
+    return [
+        name
+        for k, name in enumerate(finger.joint_names)
+        if k > moved and turns and not finger.prismatic[k] and _span(q[:, k] - x) < _MAX_UNLIKE * _span(x)
+    ]
+
+
 def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Report) -> None:
     """Check that the joints and tendons that the experiment moves do move, and that those it holds stand still."""
     spans, still = _spans(trial), still_spans(finger)
@@ -201,10 +212,18 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         and span > MIN_MOTION
         and (trial.experiment in ("ID.4", "VD.2") or (trial.experiment == "ID.2" and trial.joint not in (None, name)))
     ]
-    for name, span in held:
+    followers = [] if moved is None or spans[moved] < MIN_MOTION else _followers(trial.q, moved, finger)
+    for name in followers:
         report.warning(
-            place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
+            place,
+            f"joint {name} turns as far as {trial.joint} at every sample, as an angle against the base does; map their "
+            "difference, each joint's angle against the link before it, or check whether the joints are coupled",
         )
+    for name, span in held:
+        if name not in followers:
+            report.warning(
+                place, f"joint {name} moves by {span:.2g} rad though {trial.experiment} holds it; check the fixture"
+            )
     if trial.experiment in NEEDS_TENDON and _span(_pulled(trial, finger)) < sizes.travel:
         message = f"tendon {trial.tendon} is never pulled; check its column, and the attribute `tendon`"
         report.warning(trial.place("tendon_force"), message)

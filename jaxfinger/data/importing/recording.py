@@ -68,7 +68,7 @@ def told_apart(paths: Sequence[Path]) -> list[str]:
 def samples_first(variables: Mapping[str, Variable]) -> dict[str, Variable]:
     """Variables of which arrays that lie joints first are turned: k×N, where k < N, beside a vector of N samples.
 
-    Beside an array `run.q` lie the members of the same structure (`run.t`), and those around it (`t`).
+    Beside an array `outer.q` lie the members of the same structure, as `outer.t`, and those around it, as `t`.
     """
     counts: dict[str, set[int]] = {}
     for name, v in variables.items():

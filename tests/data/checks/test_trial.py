@@ -1,0 +1,24 @@
+"""What a trial moves and holds fits its experiment."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.bad_input import complaints
+
+
+@pytest.mark.parametrize("experiment", ["ID.2", "ID.3-dynamic"])
+def test_an_angle_against_the_base_is_said(session, experiment):
+    """Joint angles are against the link before; a camera or an inertial sensor gives their sums."""
+
+    def summed(trial, q):
+        return replace(trial, q=q) if trial.experiment == experiment and trial.joint == "MCP" else trial
+
+    against_base = replace(session, trials={t.name: summed(t, np.cumsum(t.q, axis=1)) for t in session})
+    words = "joint PIP turns as far as MCP at every sample, as an angle against the base does"
+    assert any(words in text for text in complaints(against_base))
+    assert not any("though ID.2 holds it" in text for text in complaints(against_base))
+    # A fixture that yields, or joints that are coupled by another ratio, are no such angles.
+    yielding = {t.name: summed(t, t.q + 0.5 * t.q[:, :1] * [0.0, 1.0]) for t in session}
+    assert not any(words in text for text in complaints(replace(session, trials=yielding)))
