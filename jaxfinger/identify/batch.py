@@ -1,9 +1,9 @@
 """Fits of many sessions in one compiled program: specimens of a lab, or simulated sessions.
 
 All sessions (the members) share the protocol, the recipe and the noise of one session that was identified by itself,
-the template. Each member starts from the template's parameters with links of its own, and runs the stages of `identify`
-in order, by the same solver on the same rows, through `optimistix.least_squares`. A member that fails or does not
-converge is reported and does not change the others.
+the template. Each member starts from the template's parameters with links of its own, whose standard deviations are
+its own, too, and runs the stages of `identify` in order, by the same solver on the same rows, through
+`optimistix.least_squares`. A member that fails or does not converge is reported and does not change the others.
 """
 
 from collections.abc import Sequence
@@ -19,24 +19,27 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.compilation import one_blas_thread, quick_jit
 from jaxfinger.data import Session
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, require
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, huber, white_rows
-from jaxfinger.identify.parameters import Free, describe, ravel, with_flat
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel, with_flat
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import (
     Batching,
     Compressed,
+    Plan,
     batching_here,
     compress,
     plan_of,
+    prior_block,
     staged_step,
-    std_from_noise,
+    variance_parts,
+    variances,
 )
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
-from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
+from jaxfinger.identify.stages import cad_covariance, cad_prior, nominal_model, sources_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these
@@ -48,7 +51,7 @@ class Members:
     """Fits of S sessions."""
 
     values: Float[np.ndarray, "S P"]  # flat vectors; NaN where a member failed
-    # From the noise, widened as much as the template's are (`intervals`); infinite where these are.
+    # The part from the noise is widened as much as the template's is (`intervals`); infinite where the template's are.
     std: Float[np.ndarray, "S P"]
     failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
     steps: np.ndarray  # linearisations of each member, summed over stages
@@ -87,9 +90,16 @@ class _Stage(eqx.Module):
     affine: tuple[bool, ...] = eqx.field(static=True)  # whether each of them is affine in the free parameters
     free: Int[Array, " p"]  # positions in the flat vector
     mean: Float[Array, "S p"]  # of the prior
-    root: Float[Array, "k p"]
+    root: Float[Array, "S k p"]
     low: Float[Array, "S p"]
     high: Float[Array, "S p"]
+
+
+class _Described(eqx.Module):
+    """What the standard deviations of each member's description say of the q coordinates of `resample`."""
+
+    scale: Float[Array, "S q"]  # of a value that is given: its standard deviation over that of the template's session
+    prior: Float[Array, "S q+1 q+1"]  # Gram matrix of the prior's rows
 
 
 @one_blas_thread
@@ -104,15 +114,18 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
     Members(2 fits by recipe 'emps': 0 failed)
 
     Raises:
-        UserError: a session has another protocol than the template's, or other joints or tendons.
+        UserError: a session has another protocol than the template's, other joints or tendons, or a description that
+            gives standard deviations of other values.
     """
+    require(Fit, template=template)
+    require(Session, of=of, **{f"session {k} of those to fit": s for k, s in enumerate(sessions)})
     if not sessions:
         empty = np.zeros((0, ravel(template.model).size))
         return Members(empty, empty, np.zeros(0, bool), np.zeros(0, int), template)
     compressed, how = compress(of, template), batching_here(batching)
-    coordinates = jnp.asarray(compressed.basis), compressed.sizes, compressed.grams.H[-1], compressed.grams.reads
+    coordinates = jnp.asarray(compressed.basis), compressed.sizes, compressed.grams.reads
     shared = nominal_model(of, template.recipe)
-    starts = [_start(s, template, shared) for s in sessions]
+    starts = [_start(s, template, shared, of) for s in sessions]
     at_once = min(len(sessions), SESSIONS_AT_ONCE)
     with ThreadPoolExecutor(1) as device:
         shares = []
@@ -124,27 +137,36 @@ def fit_many(sessions: Sequence[Session], template: Fit, of: Session, batching: 
             limit = jnp.asarray(template.recipe.fit.huber)
             shares.append(device.submit(_fit_all, template.model, start, *work, coordinates, limit, how))
     columns = zip(*(s.result() for s in shares), strict=True)
-    values, std, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
+    values, parts, sound, steps = (np.concatenate(a)[: len(sessions)] for a in columns)
+    noise, given = variances(compressed)
+    wider = np.maximum(template.std**2 - given, 0.0)
+    std = np.sqrt(parts[:, 0] * np.divide(wider, noise, out=np.ones_like(noise), where=noise > 0.0) + parts[:, 1])
     values[~sound], std[~sound] = np.nan, np.nan
-    noise = std_from_noise(compressed)
-    std *= np.divide(template.std, noise, out=np.ones_like(noise), where=noise > 0.0)
     std[np.ix_(sound, ~np.isfinite(template.std))] = np.inf
     return Members(values, std, ~sound, steps, template)
 
 
-def _start(session: Session, template: Fit, shared: Model) -> Float[Array | np.ndarray, " P"]:
+def _start(session: Session, template: Fit, shared: Model, of: Session) -> Float[Array | np.ndarray, " P"]:
     """Flat vector from which a session starts: the template's, with the links of the session's own description."""
     own = nominal_model(session, template.recipe)
     if jax.tree.structure(own) != jax.tree.structure(shared):
         raise UserError(
             f"{session.file or session.specimen}: has not the joints and tendons of the other sessions; fit it alone"
         )
+    parameters = describe(template.model)
+    here, there = (np.diag(cad_covariance(s, parameters)) > 0.0 for s in (session, of))
+    if np.any(here != there):
+        name = parameters[int(np.argmax(here != there))].name
+        raise UserError(
+            f"{session.file or session.specimen}: /finger: only one of this session and of the template's gives a "
+            f"standard deviation of {name}; give it in both, or fit this one alone"
+        )
     return ravel(template.model) + ravel(own) - ravel(shared)
 
 
 def _stack_sessions(
     sessions: Sequence[Session], template: Fit, compressed: Compressed, starts: Float[Array, "S P"]
-) -> tuple[tuple[_Source, ...], tuple[_Stage, ...]]:
+) -> tuple[tuple[_Source, ...], tuple[_Stage, ...], _Described]:
     plan, parameters = plan_of(sessions[0], template), describe(template.model)
     reads = {e: c for r, _ in plan for e, c in r.items()}
     prepared = [readings_of(s, [t.name for t in s if t.experiment in reads]) for s in sessions]
@@ -183,12 +205,27 @@ def _stack_sessions(
                 tuple(single[e].is_affine(template.model, free) for e in mine),
                 jnp.asarray(free),
                 jnp.asarray(np.stack([p.mean for p in priors])),
-                jnp.asarray(priors[0].root),
+                jnp.asarray(np.stack([p.root for p in priors])),
                 low,
                 high,
             )
         )
-    return tuple(sources), tuple(stages)
+    return tuple(sources), tuple(stages), _described(sessions, template, compressed, plan, parameters)
+
+
+def _described(
+    sessions: Sequence[Session], template: Fit, compressed: Compressed, plan: Plan, parameters: list[Parameter]
+) -> _Described:
+    basis, k = compressed.basis, compressed.sizes[0]
+    at = basis[:, :k].argmax(axis=0)  # positions of the values that are given, of which each column holds one
+    priors, scales = [], []
+    for s in sessions:
+        rows, scale = prior_block(s, template, plan, parameters), np.ones(basis.shape[1])
+        M = np.column_stack([rows[:, :-1] @ basis, rows[:, -1]])
+        scale[:k] = np.sqrt(np.diag(cad_covariance(s, parameters))[at]) / basis[at, np.arange(k)]
+        priors.append(M.T @ M)
+        scales.append(scale)
+    return _Described(jnp.asarray(np.stack(scales)), jnp.asarray(np.stack(priors)))
 
 
 def _measured_rows(masks: list[Float[Array, "S _columns B T"]]) -> Int[np.ndarray, " r"]:
@@ -209,18 +246,29 @@ def _padded(batch: Batch, T: int) -> Batch:
 
 
 @quick_jit
-def _fit_all(model, starts, sources, stages, coordinates, limit, batching):
+def _fit_all(model, starts, sources, stages, described, coordinates, limit, batching):
     def one(member):
-        start, batches, known = member
+        start, batches, known, own_description = member
         own = [eqx.tree_at(lambda s: s.batch, s, b) for s, b in zip(sources, batches, strict=True)]
-        theirs = [eqx.tree_at(lambda s: (s.mean, s.low, s.high), s, k) for s, k in zip(stages, known, strict=True)]
-        return _fit(model, start, own, theirs, coordinates, limit)
+        theirs = [eqx.tree_at(of_each, s, k) for s, k in zip(stages, known, strict=True)]
+        return _fit(model, start, own, theirs, own_description, coordinates, limit)
 
-    members = (starts, [s.batch for s in sources], [(s.mean, s.low, s.high) for s in stages])
+    def of_each(stage: _Stage):
+        return stage.mean, stage.root, stage.low, stage.high
+
+    members = (starts, [s.batch for s in sources], [of_each(s) for s in stages], described)
     return jax.lax.map(one, members) if batching == "map" else jax.vmap(one)(members)
 
 
-def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit):
+def _fit(
+    model: Model,
+    start: Float[Array, " P"],
+    sources: list[_Source],
+    stages: list[_Stage],
+    described: _Described,
+    coordinates,
+    limit,
+):
     """Run the stages of one member in order, then compute its covariance."""
     model = with_flat(model, start)  # the member's own links
     flat, sound, steps = start, jnp.array(True), jnp.array(0)
@@ -229,9 +277,10 @@ def _fit(model: Model, start: Float[Array, " P"], sources: list[_Source], stages
         flat = flat.at[stage.free].set(found.value)
         sound &= found.result == optx.RESULTS.successful
         steps += found.stats["linearisations"]
-    covariance, seen = _covariance(model, flat, sources, stages, coordinates, limit)
-    variance = jnp.sum((coordinates[0] @ covariance) * coordinates[0], axis=1)
-    return flat, jnp.sqrt(jnp.maximum(variance, 0.0)), sound & seen & jnp.all(jnp.isfinite(flat)), steps
+    covariance, seen = _covariance(model, flat, sources, stages, described, coordinates, limit)
+    basis, sizes, _ = coordinates
+    variances = variance_parts(basis * described.scale[None], covariance, sizes[0])
+    return flat, variances, sound & seen & jnp.all(jnp.isfinite(flat)), steps
 
 
 def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], stage: _Stage, limit):
@@ -258,17 +307,29 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
 
 
 def _covariance(
-    model: Model, flat: Float[Array, " P"], sources: list[_Source], stages: list[_Stage], coordinates, limit
+    model: Model,
+    flat: Float[Array, " P"],
+    sources: list[_Source],
+    stages: list[_Stage],
+    described: _Described,
+    coordinates,
+    limit,
 ):
-    """Covariance of the coordinates of `resample` at the optimum, and whether the trials determine all of them."""
-    basis, sizes, prior, reads = coordinates
+    """Covariance at the optimum of the coordinates of `resample`, in units of `described.scale`.
+
+    Returns:
+        The covariance, and whether the trials determine all of the coordinates.
+    """
+    basis, sizes, reads = coordinates
     q, last = basis.shape[1], reads[:, -1]
-    H = last[:, None, None] * prior[None]
+    H = last[:, None, None] * described.prior[None]
     for k, s in enumerate(sources):
         gram = _gram(model, flat, s, limit)
         own = jnp.append(s.coordinates, q)
         of_stage = jnp.array([float(k in stage.reads) for stage in stages])
         H = H.at[:, own[:, None], own].add(of_stage[:, None, None] * gram[None])
+    units = jnp.append(described.scale, 1.0)
+    H = H * (units[:, None] * units[None])[None]
     _, covariance, sound = staged_step(H, sizes, jnp.zeros(sizes[0]))
     return covariance, sound
 

@@ -25,7 +25,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
-from jaxfinger.identify.parameters import Free, describe, ravel
+from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import visible
@@ -33,6 +33,8 @@ from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources
 from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]
+# For each stage the channels that it reads, by experiment, and the positions of the parameters that it estimates.
+Plan = list[tuple[dict[str, tuple[str, ...]], np.ndarray]]
 # Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means
 # that a standard deviation would grow by 10⁴: the weighted trials do not determine the combination.
 MIN_PIVOT = 1e-4
@@ -79,7 +81,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
         trials += [(e, t) for t in stacks[e].trials]
 
     information = sum(b[:, :-1].T @ b[:, :-1] for b in blocks)
-    prior = _prior_block(session, fit, plan, parameters)
+    prior = prior_block(session, fit, plan, parameters)
     blocks.append(prior)
     reads = np.array([[*(float(e in r) for e, _ in trials), 1.0] for r, _ in plan])
     bases = [_given(session, plan, parameters)]
@@ -105,8 +107,8 @@ def compress(session: Session, fit: Fit) -> Compressed:
     )
 
 
-def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]], np.ndarray]]:
-    """Channels read, by experiment, and positions estimated, for each stage of a fit.
+def plan_of(session: Session, fit: Fit) -> Plan:
+    """What each stage of a fit reads and estimates.
 
     A stage is left out where later ones estimate all of its parameters again.
 
@@ -136,7 +138,9 @@ def plan_of(session: Session, fit: Fit) -> list[tuple[dict[str, tuple[str, ...]]
     return [p for p, after in zip(plan, later, strict=True) if not np.isin(p[1], after).all()]
 
 
-def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarray, "rows {len(parameters)}+1"]:
+def prior_block(
+    session: Session, fit: Fit, plan: Plan, parameters: list[Parameter]
+) -> Float[np.ndarray, "rows {len(parameters)}+1"]:
     """Rows [root, root (θ − mean)] of the description's prior on the estimated parameters, at the fit."""
     free = np.unique(np.concatenate([f for _, f in plan]))
     prior = cad_prior(session, fit.recipe, parameters, free)
@@ -146,7 +150,7 @@ def _prior_block(session: Session, fit: Fit, plan, parameters) -> Float[np.ndarr
     return rows
 
 
-def _given(session: Session, plan, parameters) -> Float[np.ndarray, "P k"]:
+def _given(session: Session, plan: Plan, parameters: list[Parameter]) -> Float[np.ndarray, "P k"]:
     """Basis of z_0: one standard deviation of each parameter that the description gives and no stage estimates."""
     std = np.sqrt(np.diag(cad_covariance(session, parameters)))
     std[np.concatenate([free for _, free in plan])] = 0.0
@@ -179,10 +183,19 @@ def refit(
     return theta, failed
 
 
-def std_from_noise(compressed: Compressed) -> Float[np.ndarray, " P"]:
-    """Standard deviations in SI units of all trials' fit, from their noise alone; zero where nothing is estimated."""
+def variances(compressed: Compressed) -> Float[np.ndarray, "2 P"]:
+    """Variances in SI units of all trials' fit: those that their noise alone makes, and those that z_0 makes."""
     covariance = np.asarray(_covariance(compressed.grams, compressed.sizes))
-    return np.sqrt(np.maximum(np.sum((compressed.basis @ covariance) * compressed.basis, axis=1), 0.0))
+    return variance_parts(compressed.basis, covariance, compressed.sizes[0])
+
+
+def variance_parts(
+    basis: Float[Array | np.ndarray, "P q"], covariance: Float[Array | np.ndarray, "q q"], given: int
+) -> Float[Array | np.ndarray, "2 P"]:
+    """Variances that noise makes, and those that the `given` coordinates z_0 make, which are independent of it."""
+    xp = basis.__array_namespace__()
+    inherited = xp.sum((basis @ covariance[:, :given]) ** 2, axis=1)  # the covariance of z_0 is the identity
+    return xp.stack([xp.maximum(xp.sum((basis @ covariance) * basis, axis=1) - inherited, 0.0), inherited])
 
 
 def batching_here(batching: Batching | None) -> Batching:

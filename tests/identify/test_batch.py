@@ -44,23 +44,29 @@ def with_bursts(session):
     return replace(session, trials=trials)
 
 
+def with_vaguer_links(session):
+    """Session whose description knows masses and centres of mass ten times less well."""
+    vague = {k: 10.0 * getattr(session.finger, k) for k in ("mass_std", "com_std")}
+    return replace(session, finger=replace(session.finger, **vague))
+
+
 def with_heavier_links(session):
     return replace(session, finger=replace(session.finger, mass=1.2 * session.finger.mass))
 
 
 @pytest.fixture(scope="module")
 def members(sessions, session, staged):
-    """Fits of two plain sessions, one without a joint's excursions, and the second with bursts and heavy links."""
+    """Fits of two plain sessions, one without excursions of a joint, and the second with bursts, heavy, vague links."""
     second = sessions[1]
-    odd = [without_excursion(sessions[2]), with_bursts(second), with_heavier_links(second)]
+    odd = [without_excursion(sessions[2]), with_bursts(second), with_heavier_links(second), with_vaguer_links(second)]
     return fit_many([*sessions[:2], *odd], staged, session)
 
 
 @pytest.mark.long
 def test_members_that_fail_are_named_and_spoil_nothing(members):
-    np.testing.assert_array_equal(members.failed, [False, False, True, False, False])
+    np.testing.assert_array_equal(members.failed, [False, False, True, False, False, False])
     assert np.isnan(members.values[2]).all()
-    assert np.isfinite(members.values[[0, 1, 3, 4]]).all()
+    assert np.isfinite(members.values[[0, 1, 3, 4, 5]]).all()
 
 
 @pytest.mark.long
@@ -110,6 +116,37 @@ def test_members_keep_their_own_links(members, sessions, staged):
     difference = (members.values[4] - np.asarray(ravel(alone.model)))[free] / alone.std[free]
     assert np.abs(difference).max() < 0.5
     assert np.abs((members.values[4] - members.values[0])[free] / staged.std[free]).max() > 3.0
+
+
+@pytest.mark.long
+def test_members_keep_their_own_standard_deviations_of_what_is_given(members, sessions):
+    """The errors of links that CAD gives enter elastic torque and tendon friction."""
+    alone = identify(with_vaguer_links(sessions[1]))
+    free, given = alone.estimated, np.setdiff1d(np.flatnonzero(alone.std), alone.estimated)
+    np.testing.assert_allclose(members.std[5][given], alone.std[given])
+    np.testing.assert_allclose(members.values[5], members.values[1])
+    ratio = members.std[5][free] / alone.std[free]
+    assert 0.7 < ratio.min() < ratio.max() < 1.4
+    assert (members.std[5][free] / members.std[1][free]).max() > 2.0
+
+
+@pytest.mark.long
+def test_members_keep_their_own_prior_whatever_stands_beside_them(sessions, session, staged):
+    recipe = replace(staged.recipe, fit=replace(staged.recipe.fit, free_inertia=True))
+    template, vague = identify(session, recipe), with_vaguer_links(sessions[1])
+    members, alone = fit_many([sessions[1], vague], template, session), identify(vague, recipe)
+    free = alone.estimated
+    difference = (members.values - np.asarray(ravel(alone.model)))[:, free] / alone.std[free]
+    assert np.abs(difference[1]).max() < 0.5
+    assert np.abs(difference[0]).max() > 1.0  # the narrow prior leads elsewhere
+    ratio = members.std[1][free] / alone.std[free]
+    assert 0.7 < ratio.min() < ratio.max() < 1.4
+
+
+def test_a_session_whose_description_knows_other_values_is_refused(session, staged):
+    known = replace(session, finger=replace(session.finger, mass_std=None))
+    with pytest.raises(UserError, match="gives a standard deviation of mass MCP; give it in both"):
+        fit_many([session, known], staged, session)
 
 
 def test_a_session_of_another_finger_is_refused(session, staged):
