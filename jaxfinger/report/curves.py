@@ -16,6 +16,7 @@ from jaxfinger.data.signals.quantiles import quantile
 from jaxfinger.data.signals.sizes import highest_tension
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import Fit
+from jaxfinger.identify.parameters import describe
 from jaxfinger.model import Model, rigid_body
 from jaxfinger.report.measured import Points, arm_points, hold_points, loss_points
 
@@ -44,6 +45,8 @@ class JointCurves:
 
     elastic: Curve
     friction: Curve
+    forwards: Curve  # elastic torque and friction while the joint moves slowly in the positive direction
+    backwards: Curve  # and in the negative direction
     gravity: Float[np.ndarray, " S"]
     damping: tuple[float, float]  # value and standard deviation, N mm s/rad (N s/m)
     prismatic: bool
@@ -94,15 +97,15 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
     led, swept = (_each_through(_moved(fit, session, stage)) for stage in ("ID.2", "ID.3"))
     f = np.linspace(0.0, tension, S)
     values, std = fit.function(_Values(*jax.device_put((led, swept, np.tile(f, (finger.n, 1))))))
-    cuts = np.cumsum((finger.n * m * S, m * S, m * S, m))
-    arms, elastic, friction, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
+    cuts = np.cumsum((finger.n * m * S, 4 * m * S, m))
+    arms, torques, damping, loss = zip(np.split(values, cuts), np.split(std, cuts), strict=True)
     gravity = np.asarray(_gravity_torque(model.finger, jax.device_put(swept)))
     gravity = np.where(np.abs(gravity) > ROUNDING * np.abs(gravity).max(initial=0.0), gravity, 0.0)
 
     def shaped(pair, shape):
         return tuple(a.reshape(shape) for a in pair)
 
-    arms, elastic, friction = shaped(arms, (finger.n, m, S)), shaped(elastic, (m, S)), shaped(friction, (m, S))
+    arms, torques = shaped(arms, (finger.n, m, S)), shaped(torques, (4, m, S))
     # A clipped loss keeps the standard deviation of the unclipped law.
     loss = np.clip(loss[0].reshape(finger.n, S), 0.0, f), loss[1].reshape(finger.n, S)
     angle = [(1e3 if p else 180 / np.pi) for p in finger.prismatic]
@@ -117,8 +120,7 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
         },
         {
             j: JointCurves(
-                Curve(swept[i, i] * angle[i], elastic[0][i] * torque[i], elastic[1][i] * torque[i]),
-                Curve(swept[i, i] * angle[i], friction[0][i] * torque[i], friction[1][i] * torque[i]),
+                *(Curve(swept[i, i] * angle[i], *(a[k, i] * torque[i] for a in torques)) for k in range(4)),
                 gravity[i, i] * torque[i],
                 (float(damping[0][i] * torque[i]), float(damping[1][i] * torque[i])),
                 finger.prismatic[i],
@@ -155,8 +157,6 @@ def _each_through(ranges: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m m S"
 
 def _estimated(fit: Fit) -> set:
     """Joints, tendons and (tendon, joint) pairs of the parameters that the fit has estimated."""
-    from jaxfinger.identify.parameters import describe
-
     found, parameters = set(), describe(fit.model)
     for i in fit.estimated:
         p = parameters[i]
@@ -179,10 +179,11 @@ class _Values(eqx.Module):
     def __call__(self, model: Model) -> Float[Array, " k"]:
         own, h = np.arange(len(self.led)), model.joint_torque
         C = model.moment_arm.coupling(self.led)  # (n, m, m, S); a joint's own angle varies in its own row
+        elastic, friction = (f(self.swept)[own, own] for f in (h.elastic_torque, h.friction_magnitude))
+        middle = elastic + h.friction_by_direction[:, None]
         parts = (
             C[:, own, own],
-            h.elastic_torque(self.swept)[own, own],
-            h.friction_magnitude(self.swept)[own, own],
+            *(elastic, friction, middle + friction, middle - friction),
             h.damping,
             model.tendon_friction.loss(self.tension),
         )

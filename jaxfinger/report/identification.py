@@ -17,9 +17,7 @@ PANELS_PER_ROW = 3  # A finger has three joints, an arm up to seven.
 
 
 @look()
-def draw_identification(
-    fit: Fit, session: Session, folder: str | Path, overwrite: bool = False, suffix: str = ".svg"
-) -> list[Path]:
+def draw_identification(fit: Fit, session: Session, folder: str | Path, overwrite: bool = False) -> list[Path]:
     """Write the figures for which the fit has estimated something; return the paths.
 
     Raises:
@@ -37,7 +35,7 @@ def draw_identification(
         figure, ((ax,),) = grid(1, 1, 4.6, 3.2)
         plots.tendon_friction(found, ax)
         figures["tendon-friction"] = figure
-    return [save(f, folder / f"{name}{suffix}", overwrite) for name, f in figures.items()]
+    return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
 
 
 def _panels(draw, found, joints: list[str]) -> Figure:

@@ -97,19 +97,19 @@ def _fixed(value: float, decimals: int) -> str:
     return text.removeprefix("-") if not text.strip("-0.") else text
 
 
-def quantity(value: float, units: str, digits: int = 2) -> str:
-    """An SI quantity in the unit of `scaled`: 6.1e-6 m gives «6.1 µm»."""
+def quantity(value: float, units: str) -> str:
+    """An SI quantity in the unit of `scaled`, with two digits: 6.1e-6 m gives «6.1 µm»."""
     if not math.isfinite(value):
         return DASH
-    factor, unit = scaled(float(f"{value:.{digits}g}"), units)
-    return _joined(number(value * factor, digits), unit)
+    factor, unit = scaled(float(f"{value:.2g}"), units)
+    return _joined(number(value * factor, 2), unit)
 
 
-def alike(values: Sequence[float], units: str, digits: int = 2) -> tuple[list[str], str]:
-    """SI quantities as numbers in the unit that suits the largest, and the name of that unit."""
+def alike(values: Sequence[float], units: str) -> tuple[list[str], str]:
+    """SI quantities as numbers of two digits in the unit that suits the largest, and the name of that unit."""
     largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
-    factor, unit = scaled(float(f"{largest:.{digits}g}"), units)
-    return [number(v * factor, digits) for v in values], _joined("", unit).strip()
+    factor, unit = scaled(float(f"{largest:.2g}"), units)
+    return [number(v * factor, 2) for v in values], _joined("", unit).strip()
 
 
 def measured(value: float, std: float | None, units: str) -> str:

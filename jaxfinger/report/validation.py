@@ -22,9 +22,7 @@ MAX_PANELS = 3  # VD.2 trials in one figure, which then fits across a page
 
 
 @look()
-def draw_validation(
-    fit: Fit, session: Session, folder: str | Path, overwrite: bool = False, suffix: str = ".svg"
-) -> list[Path]:
+def draw_validation(fit: Fit, session: Session, folder: str | Path, overwrite: bool = False) -> list[Path]:
     """Write one figure for each validation experiment of the session; return the paths.
 
     Raises:
@@ -40,7 +38,7 @@ def draw_validation(
         figures["vd2"] = _vd2(model, session, prepare(session, names)["VD.2"])
     if trials := list(session.select("VD.3")):
         figures["vd3"] = _vd3(model, session, trials[0])
-    return [save(f, folder / f"{name}{suffix}", overwrite) for name, f in figures.items()]
+    return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
 
 
 def _vd1(model: Model, session: Session, trial: Trial) -> Figure:

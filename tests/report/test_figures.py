@@ -70,6 +70,25 @@ def test_curves_are_polynomials_with_their_spread(fit):
     np.testing.assert_allclose(loss.y, np.clip(raw, 0, loss.x), atol=1e-12)
 
 
+def test_torque_and_friction_together_have_the_interval_of_their_sum(fit):
+    """Of a joint that turns one way the trials show the sum of elastic torque and friction, and neither of them."""
+    names = [p.name for p in describe(fit.model)]
+    i, j = (names.index(f"{kind} torque MCP^0") for kind in ("elastic", "friction"))
+    covariance = np.zeros_like(fit.covariance)
+    covariance[np.ix_([i, j], [i, j])] = 1e-6 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    c = curves(replace(fit, covariance=covariance)).joints["MCP"]
+    for curve, std in ((c.elastic, 1.0), (c.friction, 1.0), (c.forwards, 0.0), (c.backwards, 2.0)):
+        np.testing.assert_allclose(curve.std, std, atol=1e-6)  # N mm
+    np.testing.assert_allclose(c.forwards.y - c.backwards.y, 2.0 * c.friction.y, atol=1e-12)
+
+
+def test_friction_that_differs_by_direction_moves_both_lines(fit):
+    flat = np.array(ravel(fit.model))
+    flat[[p.name for p in describe(fit.model)].index("friction torque by direction MCP")] = 2e-3
+    c = curves(replace(fit, model=with_flat(fit.model, flat))).joints["MCP"]
+    np.testing.assert_allclose((c.forwards.y + c.backwards.y) / 2.0, c.elastic.y + 2.0, rtol=1e-9)
+
+
 def test_only_what_was_estimated_is_shown(fit):
     names = [p.name for p in describe(fit.model)]
     one = replace(fit, estimated=np.array([names.index("excursion T2 DIP^1")]))
@@ -146,7 +165,8 @@ def test_what_was_measured_lies_on_the_lines(fit, session):
     ways = [(c, way, p) for c in found.joints.values() for way, p in ((1, c.flexing), (-1, c.extending)) if p]
     assert len(ways) >= 2
     for c, way, points in ways:
-        line = np.interp(points.x, c.elastic.x, c.elastic.y + way * c.friction.y)
+        curve = c.forwards if way > 0 else c.backwards
+        line = np.interp(points.x, curve.x, curve.y)
         np.testing.assert_allclose(points.y, line, atol=0.6)
 
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxfinger.errors import UserError
 from jaxfinger.identify.sensitivity import Sensitivity
 from jaxfinger.report import plots
+from jaxfinger.report.curves import Curve, Curves
 from jaxfinger.report.plots.gap import segments
 from jaxfinger.report.theme import LOOK, axes_or_new
 
@@ -130,6 +132,23 @@ def test_what_one_trial_alone_tells_of_is_as_large_as_the_largest():
     ax = plots.influence(held({(7, 3): 2.0, (21, 5): np.inf}), fits()[1], most=2)
     squares = ax.collections[0]
     assert len(set(squares.get_sizes())) == 1
+
+
+def test_a_curve_that_a_fit_has_not_is_refused():
+    fit, straight = fits()[1], Curve(*np.zeros((3, 5)))
+    with pytest.raises(UserError, match=r"no moment arm about joint 'mcp' \(did you mean 'MCP'\?\); there are MCP"):
+        plots.moment_arms(Curves({("T1", "MCP"): straight}, {}, {}), "mcp")
+    with pytest.raises(UserError, match="no torque of joint 'thumb'"):
+        plots.joint_torque(fit, "thumb")
+    with pytest.raises(UserError, match="no estimated parameter 'mass'"):
+        plots.intervals(fit, ["mass"])
+
+
+def test_a_diagnosis_is_drawn_like_its_closures():
+    d, (one, other) = every()["two"], (axes_or_new(None), axes_or_new(None))
+    plots.closure(d, one)
+    plots.closure(d.closures, other)
+    assert [t.get_text() for t in one.texts] == [t.get_text() for t in other.texts] != []
 
 
 def test_measured_in_points_and_the_model_as_lines():

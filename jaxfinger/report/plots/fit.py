@@ -9,6 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from jaxfinger.errors import chosen, require
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import describe
 from jaxfinger.identify.sensitivity import Sensitivity
@@ -45,9 +46,13 @@ def intervals(
         parameters: names to show, in this order; by default all that were estimated.
         before: another fit, whose values of the same parameters are marked.
         ax: the axes to draw on; by default those of a new figure.
+
+    Raises:
+        UserError: the fit has estimated no parameter of such a name.
     """
+    require(Fit, fit=fit)
     table = {r["name"]: r for r in fit.table()}
-    rows = [table[n] for n in (table if parameters is None else parameters)]
+    rows = [table[n] for n in chosen(table if parameters is None else parameters, table, "estimated parameter")]
     ax = axes_or_new(ax, *interval_size(len(rows), 4.6))
     old = {} if before is None else {r["name"]: r["value"] for r in before.table()}
     at, width = ax.get_yaxis_transform(), ax.figure.bbox.width / ax.figure.dpi

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
+from jaxfinger.errors import require
 from jaxfinger.gap.result import ChannelBudget, Closure, Diagnosis
 from jaxfinger.report.names import cause_name, channel_name
 from jaxfinger.report.numbers import alike, quantity
@@ -76,6 +77,7 @@ def budget(d: Diagnosis, ax: Axes | None = None) -> Axes:
         d: the diagnosis.
         ax: the axes to draw on; by default those of a new figure.
     """
+    require(Diagnosis, d=d)
     ax = axes_or_new(ax, *budget_size(d, 6.4))
     rows = rows_of(d)
     for y, x in enumerate(rows):
@@ -116,16 +118,16 @@ def shown(lines: Sequence[Closure]) -> list[Closure]:
 
 
 @look()
-def closure(lines: Sequence[Closure], ax: Axes | None = None) -> Axes:
+def closure(of: Diagnosis | Sequence[Closure], ax: Axes | None = None) -> Axes:
     """Draw how far each channel closes on held-out trials, and return the axes.
 
     Values are rms relative to the noise, before and after, on a logarithmic axis. Channels that stay open are red.
 
     Args:
-        lines: `closures` of the diagnosis.
+        of: the diagnosis, or some of its `closures`.
         ax: the axes to draw on; by default those of a new figure.
     """
-    rows = shown(lines)
+    rows = shown(of.closures if isinstance(of, Diagnosis) else of)
     changed = any(x.before != x.after for x in rows)
     ax = axes_or_new(ax, *closure_size(rows, 5.0))
     for y, x in enumerate(rows):

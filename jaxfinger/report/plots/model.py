@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
+from jaxfinger.errors import chosen, require
 from jaxfinger.identify import Fit
 from jaxfinger.report.curves import Curves, JointCurves, curves
 from jaxfinger.report.measured import Points
@@ -22,6 +23,7 @@ from jaxfinger.report.theme import (
 
 
 def _curves(of: Fit | Curves) -> Curves:
+    require((Fit, Curves), of=of)
     return of if isinstance(of, Curves) else curves(of)
 
 
@@ -45,8 +47,13 @@ def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
         of: a fit, or its `curves`, which are then computed once for many panels.
         joint: name of the joint.
         ax: the axes to draw on; by default those of a new figure.
+
+    Raises:
+        UserError: the fit has estimated no moment arm about this joint.
     """
-    found, ax = _curves(of), axes_or_new(ax)
+    found = _curves(of)
+    chosen(joint, dict.fromkeys(j for _, j in found.moment_arm), "moment arm about joint")
+    ax = axes_or_new(ax)
     tendons = list(dict.fromkeys(t for t, _ in found.moment_arm))
     for k, tendon in enumerate(tendons):
         if (tendon, joint) in found.moment_arm:
@@ -68,15 +75,19 @@ def moment_arms(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
 def joint_torque(of: Fit | Curves, joint: str, ax: Axes | None = None) -> Axes:
     """Draw the resisting torque of one joint against its angle, N mm, and return the axes (paper, Fig. 6).
 
-    Lines are the elastic torque, and its sum with friction in either direction. Points are holds, with a marker for the
-    direction in which they were reached. Arguments as in `moment_arms`.
+    Lines are the elastic torque, and its sum with friction in either direction of a slow motion. Points are holds, with
+    a marker for the direction in which they were reached. Arguments as in `moment_arms`.
+
+    Raises:
+        UserError: the fit has estimated no torque of this joint.
     """
-    c: JointCurves = _curves(of).joints[joint]
+    found = _curves(of).joints
+    chosen(joint, found, "torque of joint")
+    c: JointCurves = found[joint]
     ax = axes_or_new(ax)
     band(ax, c.elastic.x, c.elastic.y, c.elastic.std, COLOURS[0], "elastic")
-    for sign, label in ((1, "with friction"), (-1, None)):
-        std = (c.elastic.std**2 + c.friction.std**2) ** 0.5
-        band(ax, c.elastic.x, c.elastic.y + sign * c.friction.y, std, COLOURS[1], label, linestyle="--")
+    for both, label in ((c.forwards, "with friction"), (c.backwards, None)):
+        band(ax, both.x, both.y, both.std, COLOURS[1], label, linestyle="--")
     for points, marker, label in ((c.flexing, "^", "held, flexing"), (c.extending, "v", "held, extending")):
         if points is not None:
             _points(ax, points, INK, marker, label)
