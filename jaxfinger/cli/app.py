@@ -52,7 +52,7 @@ STAGES = {
     "id2": "Moment arms alone.",
     "id3": "Elastic torque, friction and damping of the joints alone.",
     "id4": "Tendon friction alone.",
-    "joint": "All trials at once, with the staged estimates as the start.",
+    "joint": "All trials at once, from an earlier fit; one of other recordings is the prior.",
     "effects": "All trials at once, with effects beyond the nominal model that are known to be there.",
 }
 SEALED = {

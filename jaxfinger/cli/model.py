@@ -172,7 +172,7 @@ def fit_joint(
     output
         Fit to write (JSON).
     start
-        The staged fit to refine.
+        The fit to refine. One of other recordings is the prior, with its covariance.
     ahead
         Refine on the motion of VD.3 too, by the angles that the fit predicts a moment ahead.
     json
@@ -263,7 +263,7 @@ def validate(
     file
         Session (HDF5), best of trials that the fit has not seen.
     experiments
-        Which experiments; by default the recipe's, VD.1, VD.2 and VD.3.
+        Which experiments; by default those of the fit's recipe, in the paper's VD.1, VD.2 and VD.3.
     effects
         The Python file of effects of your own, where the fit's model has some.
     figures

@@ -31,7 +31,7 @@ from jaxfinger.data.schema import (
     entry_units,
 )
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, require
 
 # The newest version of HDF5 files that MATLAB before R2021b and other old tools open.
 LIBVER = ("earliest", "v108")
@@ -39,9 +39,11 @@ _TEXT = h5py.string_dtype("utf-8")
 
 
 def read_session(
-    path: str | os.PathLike, trials: Collection[str] | None = None, report: Report | None = None
+    path: str | os.PathLike, trials: str | Collection[str] | None = None, report: Report | None = None
 ) -> Session:
-    """Read the session in a file, or only its named trials, in float64. Findings of the checker go to `report`.
+    """Read the session in a file, or only its named trials, one or more. Findings of the checker go to `report`.
+
+    Numbers are float64, in SI units.
 
     >>> import jaxfinger as jf
     >>> jf.read("session.h5")
@@ -50,7 +52,7 @@ def read_session(
     Raises:
         UserError: the first error that `check_file` finds, in one sentence with file, place and mend.
     """
-    session, findings = read_and_check(path, trials)
+    session, findings = read_and_check(path, (trials,) if isinstance(trials, str) else trials)
     if report is not None:
         report.extend(findings)
     fault = findings.fatal
@@ -122,6 +124,7 @@ def write_session(session: Session, path: str | os.PathLike, overwrite: bool = F
     Raises:
         UserError: the file exists and `overwrite` is false, a channel has the wrong shape, or it cannot be written.
     """
+    require(Session, session=session)
     for trial in session:
         _refuse_misshapen(trial, session.finger, path)
     with new_file(path, overwrite) as file:

@@ -14,7 +14,7 @@ from jaxfinger.data.hdf5 import new_file, open_file, write_dataset, write_header
 from jaxfinger.data.parse import child, dataset, parse_finger, parse_version, text_attribute
 from jaxfinger.data.schema import CHANNELS, TIME
 from jaxfinger.data.session import FingerDescription, Session, Trial
-from jaxfinger.errors import UserError, listed
+from jaxfinger.errors import UserError, listed, require
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -38,6 +38,8 @@ def write_predictions(
     Raises:
         UserError: the file exists and `overwrite` is false, or a trial, channel or shape does not fit the session.
     """
+    require(Session, session=session)
+    require(Mapping, predictions=predictions)
     finger = session.finger
     with new_file(path, overwrite) as file:
         write_header(file, session)

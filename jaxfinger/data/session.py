@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfinger.errors import chosen
 from jaxfinger.table import Table
 
 if TYPE_CHECKING:
@@ -192,7 +193,13 @@ class Session:
         """Session with only the trials of these experiments, this joint, this tendon and this completeness.
 
         A criterion that is not given selects all.
+
+        Raises:
+            UserError: there is no such experiment, joint or tendon.
         """
+        chosen(experiments, EXPERIMENT_NAMES, "experiment")
+        chosen(() if joint is None else joint, self.finger.joint_names, "joint")
+        chosen(() if tendon is None else tendon, self.finger.tendon_names, "tendon")
         keep = {
             t.name: t
             for t in self
@@ -203,9 +210,13 @@ class Session:
         }
         return replace(self, trials=keep)
 
-    def with_trials(self, names) -> Session:
-        """Session with only the named trials, in this order; KeyError where one is missing."""
-        return replace(self, trials={name: self.trials[name] for name in names})
+    def with_trials(self, names: str | Iterable[str]) -> Session:
+        """Session with only the named trials, one or more, in this order.
+
+        Raises:
+            UserError: there is no such trial.
+        """
+        return replace(self, trials={name: self.trials[name] for name in chosen(names, self.trials, "trial")})
 
 
 def joints_of(trial: Trial, finger: FingerDescription) -> tuple[str, ...]:

@@ -5,13 +5,14 @@ import inspect
 import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxfinger.effects import body, changed, drive, joint, nominal, sensors, tendon, transmission
 from jaxfinger.effects.base import Amplitude, CatalogueEffect, Shape, Site, amplitude, shape
 from jaxfinger.effects.changed import Changed
 from jaxfinger.effects.scales import Scales
-from jaxfinger.errors import UserError, did_you_mean
+from jaxfinger.errors import UserError, did_you_mean, require
 from jaxfinger.model import Finger
 
 
@@ -46,6 +47,38 @@ def changes(elastic_degree: int, friction_degree: int, moment_arm_degree: int) -
     return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in CHANGED.items()}
 
 
+# A user's own effects: the Python file that defines them, or their classes by id.
+OwnEffects = str | os.PathLike | Mapping[str, type[CatalogueEffect]]
+
+
+def own_effects(effects: OwnEffects | None) -> dict[str, type[CatalogueEffect]]:
+    """A user's own effects by id, loaded from their file or checked likewise.
+
+    Raises:
+        UserError: As of `load`; or a class is no effect, or stands under another name than its ID.
+    """
+    if isinstance(effects, str | os.PathLike):
+        return load(effects)
+    require((Mapping, None), effects=effects)
+    for name, kind in (effects or {}).items():
+        if not (inspect.isclass(kind) and issubclass(kind, CatalogueEffect)):
+            raise UserError(f"effects[{name!r}]: is no subclass of jaxfinger.effects.CatalogueEffect; give the class")
+        if not hasattr(kind, "ID"):
+            raise UserError(f"effects[{name!r}]: {kind.__name__} has no ID; give it one")
+        if name != kind.ID:
+            raise UserError(f"effects[{name!r}]: {kind.__name__} has the ID {kind.ID}, not {name}; give it by its ID")
+        _refuse_faulty(kind, f"effects[{name!r}]")
+    return dict(effects or {})
+
+
+def file_of(kind: type[CatalogueEffect]) -> str:
+    """File that defines an effect; of a class that was typed into a session of Python or a notebook, its module."""
+    try:
+        return inspect.getfile(kind)
+    except (TypeError, OSError):
+        return kind.__module__
+
+
 def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     """Load the effects that a user's Python file defines, by id.
 
@@ -66,20 +99,25 @@ def load(path: str | os.PathLike) -> dict[str, type[CatalogueEffect]]:
     found = _effects_in(module)
     if not found:
         raise UserError(f"{path}: defines no effect; subclass jaxfinger.effects.CatalogueEffect and give it an ID")
-    for name, kind in found.items():
-        if name in CATALOGUE | NOMINAL_TERMS | CHANGED:
-            raise UserError(f"{path}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
-        if not re.fullmatch("[a-z][a-z0-9_]*", name):
-            raise UserError(f"{path}: {kind.__name__} has the ID {name!r}; use small letters, digits and underscores")
-        place = getattr(kind, "PLACE", None)
-        if "sites" not in vars(kind) and place not in PLACES and (near := did_you_mean(place, PLACES)):
-            raise UserError(f"{path}: {kind.__name__} has the PLACE {place!r}{near}")
-        if not kind.amplitudes():
-            raise UserError(f"{path}: {kind.__name__} has no amplitude; declare a field with `amplitude`")
+    for kind in found.values():
+        _refuse_faulty(kind, path)
         for sentence in ("HAPPENS", "LOOKS", "CHANGE", "__doc__"):
             if not getattr(kind, sentence):
                 raise UserError(f"{path}: {kind.__name__} has no {sentence.strip('_')}; write its sentence")
     return found
+
+
+def _refuse_faulty(kind: type[CatalogueEffect], where: str | Path) -> None:
+    """Refuse a user's effect whose id is taken or no plain word, or that has no place or amplitude."""
+    name, place = kind.ID, getattr(kind, "PLACE", None)
+    if name in CATALOGUE | NOMINAL_TERMS | CHANGED:
+        raise UserError(f"{where}: {kind.__name__} has the ID {name}, which the catalogue has; choose another")
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise UserError(f"{where}: {kind.__name__} has the ID {name!r}; use small letters, digits and underscores")
+    if "sites" not in vars(kind) and place not in PLACES and (near := did_you_mean(place, PLACES)):
+        raise UserError(f"{where}: {kind.__name__} has the PLACE {place!r}{near}")
+    if not kind.amplitudes():
+        raise UserError(f"{where}: {kind.__name__} has no amplitude; declare a field with `amplitude`")
 
 
 def _refuse_lost(path: Path, module) -> None:
@@ -125,14 +163,17 @@ __all__ = [
     "Amplitude",
     "CatalogueEffect",
     "Changed",
+    "OwnEffects",
     "Scales",
     "Shape",
     "Site",
     "amplitude",
     "changes",
+    "file_of",
     "from_dict",
     "load",
     "nominal_terms",
+    "own_effects",
     "shape",
     "to_dict",
 ]

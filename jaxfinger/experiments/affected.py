@@ -1,6 +1,5 @@
 """Channels that an effect can change, found by tracing the dependence of predictions on the effect's amplitudes."""
 
-import inspect
 import traceback
 from dataclasses import replace
 from functools import cache
@@ -12,7 +11,7 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CatalogueEffect, file_of
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments.predict import change
 from jaxfinger.experiments.table import EXPERIMENTS
@@ -50,7 +49,7 @@ def refuse_broken(kind: type[CatalogueEffect], finger: Finger) -> None:
     Raises:
         UserError: it fails in a prediction, or changes no channel at any amplitude.
     """
-    file = inspect.getfile(kind)
+    file = file_of(kind)
     try:
         without_effect = kind.sites(finger) and not affected_channels(kind, finger)
     except Exception as e:  # The effect is a user's program, which may raise anything.

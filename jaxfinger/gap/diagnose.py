@@ -1,13 +1,14 @@
 """`diagnose`: where the gap of a session lies, which causes explain it, how far it shrinks, and what to record next."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from numbers import Real
 from pathlib import Path
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Predictions, Session
-from jaxfinger.effects import CatalogueEffect
-from jaxfinger.errors import UserError, did_you_mean
+from jaxfinger.effects import CatalogueEffect, OwnEffects, own_effects
+from jaxfinger.errors import UserError, did_you_mean, require
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.gap.augment import Fitted, as_refitted, augmented_fit, nominal_fit
 from jaxfinger.gap.budget import budget
@@ -50,6 +51,7 @@ from jaxfinger.gap.smooth_laws import measured_columns, smooth_parts
 from jaxfinger.gap.verdict import confirmed, consistent_with, verdict_of
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
+from jaxfinger.identify.recipe import checked as checked_recipe
 from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
 
@@ -61,8 +63,8 @@ def diagnose(
     session: Session,
     recipe: Recipe | None = None,
     quick: bool = False,
-    effects: dict[str, type[CatalogueEffect]] | None = None,
-    without: tuple[str, ...] = (),
+    effects: OwnEffects | None = None,
+    without: str | Sequence[str] = (),
     progress: Progress = lambda message: None,
     predictions: Predictions | CheckedPredictions | None = None,
     tolerance: Mapping[str, float] | None = None,
@@ -82,31 +84,43 @@ def diagnose(
             effects of a spring are not.
         quick: take a first look: half the samples, no joint fit of causes and nominal parameters, no forward simulation
             and no next experiment.
-        effects: the user's own effects by id, candidates beside the catalogue's.
-        without: ids of effects that are no candidates.
+        effects: the user's own effects, candidates beside the catalogue's: a Python file, or classes by id
+            (docs/add-an-effect.md).
+        without: id or ids of effects that are no candidates.
         progress: called with a message before each step.
         predictions: of another simulator, checked or not; the gap is then that between the measurements and these.
-        tolerance: by channel, the share of its signal up to which a gap does not matter.
+        tolerance: by channel, the share of its signal up to which a gap does not matter, such as 0.02.
         against: an earlier fit of the same finger. Its recipe is the nominal model, and each of its parameters may have
-            changed by more than its interval says: these changes are candidates too.
+            changed by more than its interval says: these changes are candidates too. The data of a fit of this session
+            itself count twice, which the summary says.
 
     Raises:
-        UserError: an effect to leave out or a channel to tolerate is unknown; a tolerance is no share of a signal; one
-            of the user's own effects fails in a prediction, changes none, or predicts no numbers; `predictions` has
-            none of the session's trials, does not fit them, repeats the measurements, or can only be a mistake
-            (`check_predictions`); `against` is of another finger or recipe, holds effects, or comes with
-            `predictions`.
+        UserError: a value of the recipe is not allowed; an effect to leave out or a channel to tolerate is unknown; a
+            tolerance is no share of a signal; one of the user's own effects is incomplete, fails in a prediction,
+            changes none, or predicts no numbers; `predictions` has none of the session's trials, does not fit them,
+            repeats the measurements, or can only be a mistake (`check_predictions`); `against` is of another finger or
+            recipe, holds effects, or comes with `predictions`.
     """
+    require(Session, session=session)
+    require((Recipe, None), recipe=recipe)
+    require((Fit, None), against=against)
+    require((Mapping, None), tolerance=tolerance)
+    require((Mapping, CheckedPredictions, None), predictions=predictions)
+    without = (without,) if isinstance(without, str) else tuple(without)
     if against is not None and (predictions is not None or recipe not in (None, against.recipe)):
         raise UserError("an earlier fit brings its own recipe and no other simulator; leave the other one out")
-    recipe, tolerance = recipe or (against.recipe if against else Recipe()), dict(tolerance or {})
+    recipe = checked_recipe(recipe) if recipe else against.recipe if against else Recipe()
+    tolerance = dict(tolerance or {})
     changed = changes_of(against) if against else {}
-    catalogue = catalogue_for(recipe, effects, Finger.from_description(session.finger)) | changed
+    catalogue = catalogue_for(recipe, own_effects(effects), Finger.from_description(session.finger)) | changed
     _refuse_unknown(without, catalogue)
     _refuse_odd_tolerance(tolerance)
     if predictions is not None and not isinstance(predictions, CheckedPredictions):
         predictions = checked(session, predictions, session.file or "the session")
     told, doubts = predictions or (None, ())
+    sentences = [x.sentence for x in doubts]
+    if against is not None and against.was_made_from(session):
+        sentences.append("the earlier fit was made from this session, whose data then count twice")
 
     # The nominal model, and what it misses.
     problem = build(session, recipe, progress, told, COARSE if quick else 1, against)
@@ -117,7 +131,7 @@ def diagnose(
         against=None if against is None else against.data or against.specimen,
         quick=quick,
         tolerance=tolerance,
-        doubts=tuple(x.sentence for x in doubts),
+        doubts=tuple(sentences),
     )
     if next(measured_columns(problem), None) is None:
         return _nothing_judged(problem, partial(diagnosis, problem=problem))
@@ -215,8 +229,8 @@ def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
         if channel not in channels:
             near, known = did_you_mean(channel, channels), ", ".join(channels)
             raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
-        if not 0.0 <= share < 1.0:
-            raise UserError(f"tolerance of {channel}: is {share:g}; say a share of its signal, such as 0.02")
+        if not isinstance(share, Real) or not 0.0 <= share < 1.0:
+            raise UserError(f"tolerance of {channel}: is {share!r}; say a share of its signal, such as 0.02")
 
 
 def _nothing_judged(problem: Problem, diagnosis: Callable[..., Diagnosis]) -> Diagnosis:

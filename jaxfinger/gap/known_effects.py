@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
-from jaxfinger.effects import CatalogueEffect
+from jaxfinger.effects import CatalogueEffect, OwnEffects, own_effects
 from jaxfinger.errors import UserError, did_you_mean
 from jaxfinger.experiments import affected_channels
 from jaxfinger.gap.augment import augmented_fit
@@ -26,7 +26,7 @@ def fit_with(
     session: Session,
     keys: Sequence[CauseKey],
     recipe: Recipe | None = None,
-    effects: dict[str, type[CatalogueEffect]] | None = None,
+    effects: OwnEffects | None = None,
     progress: Progress = lambda message: None,
 ) -> Fit:
     """Fit the nominal parameters and given effects at given sites to all trials together.
@@ -35,7 +35,7 @@ def fit_with(
 
     Args:
         keys: effect and site of every cause; the names of a pair of joints or tendons may be joined by a hyphen.
-        effects: a user's own effects, by id.
+        effects: a user's own effects, as of `diagnose`.
 
     Raises:
         UserError: an effect is unknown, cannot act at its site, is part of the recipe's model, or shows in no trial.
@@ -44,7 +44,7 @@ def fit_with(
     if there := [effect for effect, _ in keys if effect in recipe.model.terms]:
         raise UserError(f"{there[0]} is a term of the recipe's own model; leave it out here, or there")
     finger = Finger.from_description(session.finger)
-    catalogue = catalogue_for(recipe, effects, finger)
+    catalogue = catalogue_for(recipe, own_effects(effects), finger)
     for effect, _ in keys:
         if effect not in catalogue:
             near = did_you_mean(effect, catalogue)

@@ -297,7 +297,8 @@ class Diagnosis:
     nominal: Fit
     augmented: Fit  # the nominal fit where nothing is named
     problem: Problem | None  # recordings and residuals, for figures; None where they were dropped to save memory
-    doubts: tuple[str, ...] = ()  # sentences on another simulator's predictions, and on the trials that they lack
+    # Sentences on another simulator's predictions and the trials that they lack, or on an earlier fit.
+    doubts: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         named = ", ".join(f"{k.effect} at {'-'.join(k.site)}" for k in self.named) or "nothing named"

@@ -5,7 +5,6 @@ compiled function for each class of effects and kind of prediction therefore ser
 channels that the effect changes are evaluated.
 """
 
-import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
-from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, nominal_terms
+from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, file_of, nominal_terms
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import TRIALS, affected_channels, change, refuse_broken
 from jaxfinger.gap.problem import Problem, Rows
@@ -197,7 +196,7 @@ class Signatures:
         Raises:
             UserError: it changes a prediction at zero amplitude, or acts alike at two joints.
         """
-        finger, file = self.problem.nominal.finger, inspect.getfile(kind)
+        finger, file = self.problem.nominal.finger, file_of(kind)
         seen: dict[bytes, Site] = {}
         tried = variants({kind.ID: kind}, finger, scales)[:1]
         for site in kind.sites(finger) if tried else ():
@@ -237,7 +236,7 @@ def _refuse_no_numbers(
         if own(type(effect)) and not np.isfinite(row).all():
             values = ", ".join(f"{n} = {v:.3g}" for n, v in effect.values().items())
             raise UserError(
-                f"{inspect.getfile(type(effect))}: {effect.ID} at {'-'.join(effect.site)} predicts NaN or infinity in "
+                f"{file_of(type(effect))}: {effect.ID} at {'-'.join(effect.site)} predicts NaN or infinity in "
                 f"{channel} of {experiment} with {values}; keep every hook finite at each angle, speed and tension"
             )
 

@@ -6,11 +6,12 @@ from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxfinger.data import Session, data_hash, trial_hash
 from jaxfinger.identify.noise import Noise
-from jaxfinger.identify.parameters import describe, ravel
+from jaxfinger.identify.parameters import Free, describe, ravel, value_and_jacobian
 from jaxfinger.identify.recipe import Recipe
 from jaxfinger.model import Effect, Model
 from jaxfinger.table import Table
@@ -129,10 +130,6 @@ class Fit:
         The standard deviation is infinite where the value depends on an undetermined parameter. A program is compiled
         for each `f`; one of an `equinox.Module` that holds its arrays serves later processes, too.
         """
-        import jax
-
-        from jaxfinger.identify.parameters import Free, value_and_jacobian
-
         seen = np.isfinite(np.diag(self.covariance))
         covariance = np.where(np.outer(seen, seen), self.covariance, 0.0)
         positions = np.flatnonzero((np.diag(covariance) > 0) | ~seen)

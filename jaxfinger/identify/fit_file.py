@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxfinger.data.atomic import atomic_path
 from jaxfinger.effects import CatalogueEffect, from_dict, load, to_dict
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, require
 from jaxfinger.fit_content import SCHEMA, read_content
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.noise import Noise
@@ -53,6 +53,7 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
     Raises:
         UserError: the file exists and `overwrite` is false, or its folder cannot be written.
     """
+    require(Fit, fit=fit)
     write_content(content_of(fit), path, overwrite)
 
 

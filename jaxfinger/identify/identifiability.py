@@ -22,6 +22,7 @@ MIN_SHOWN_ENTRY, MIN_ENTRY_OF_REMEDY = 0.05, 0.3
 # Width of an interval over its width if another parameter were known, from which on the sentence names both. The other
 # parameter then makes 99 % of its variance, and noise the rest.
 MIN_WIDENING = 10.0
+RANDOM_SAMPLES = 200  # of the motions of `base_parameters`: many times the ten parameters of a link
 RANK_TOLERANCE = 1e-9  # relative, of a regressor's columns and singular values, far above rounding
 
 # Experiment of the format that determines each group of parameters.
@@ -182,19 +183,13 @@ class BaseParameters:
         return len(self.combinations)
 
 
-def base_parameters(
-    finger: Finger, instrumented: list[int] | None = None, samples: int = 200, seed: int = 0
-) -> BaseParameters:
+def base_parameters(finger: Finger) -> BaseParameters:
     """Base parameters of the chain, from the singular values of its regressor on random motions (Gautier 1991).
 
     The torque is linear in the parameters π: m, m c and the inertia about the joint of each link. A column of the
     regressor is the torque of one unit of one of them.
-
-    `instrumented`: indices of the joints whose torque is measured (default all).
     """
-    rng = np.random.default_rng(seed)
-    q, qd, qdd = rng.uniform(-1.5, 1.5, (3, finger.m, samples))
-    rows = slice(None) if instrumented is None else instrumented
+    q, qd, qdd = np.random.default_rng(0).uniform(-1.5, 1.5, (3, finger.m, RANDOM_SAMPLES))
 
     def column(i: int, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
         """Torques of the chain where link i has a mass of 1 kg and all other links none."""
@@ -202,7 +197,7 @@ def base_parameters(
         for array, value in zip(values, (1.0, com, inertia), strict=True):
             array[i] = value
         lone = eqx.tree_at(lambda f: (f.mass, f.com, f.gyration), finger, tuple(jnp.asarray(v) for v in values))
-        return np.asarray(rigid_body.inverse_dynamics(lone, q, qd, qdd))[rows].ravel()
+        return np.asarray(rigid_body.inverse_dynamics(lone, q, qd, qdd)).ravel()
 
     names, columns, axes, none = [], [], np.eye(3), np.zeros((3, 3))
     for i, joint in enumerate(finger.joint_names):

@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, require
 from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.identifiability import name_invisible, name_traded
@@ -62,6 +62,8 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         UserError: the session has none of these trials, or is of another finger; or `ahead` is given and there is no
             VD.3 trial, or the fit has effects.
     """
+    require(Session, session=session)
+    require(Fit, fit=fit)
     recipe = fit.recipe
     if ahead and fit.model.effects:
         raise UserError("a fit with effects cannot be refined ahead; give one of the nominal model")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import FingerDescription, Session, Trial, joints_of, low_pass
-from jaxfinger.errors import UserError, counted
+from jaxfinger.errors import UserError, chosen, counted, require
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Finger, Model, Motion, simulate
@@ -28,10 +28,12 @@ MAX_SHARE_APART, MAX_TILT = 0.1, 0.2
 def predict_session(
     fit: Fit | Model,
     session: Session,
-    names: list[str] | None = None,
+    names: str | Sequence[str] | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Predict the channels of the named trials (default all): `{trial: {channel: (N, columns)}}`, in SI units.
+    """Predict the channels of the named trials, one or more: `{trial: {channel: (N, columns)}}`, in SI units.
+
+    `names`: by default all trials.
 
     Channels are those of the format's table. Columns without a sensor are NaN: the torque of a joint where it was not
     measured, and the excursion of a passive tendon. A trial of fewer than two samples is left out.
@@ -42,9 +44,12 @@ def predict_session(
     (24841, 1)
 
     Raises:
-        UserError: the model's joints or tendons are not those of the session.
+        UserError: the model's joints or tendons are not those of the session, or it has no trial of that name.
     """
+    require((Fit, Model), fit=fit)
+    require(Session, session=session)
     model = model_for(fit, session)
+    names = None if names is None else [*chosen(names, session.trials, "trial")]
     out: dict[str, dict[str, np.ndarray]] = {}
     for experiment, stack in prepare(session, names, reduced=False).items():
         progress(f"predicting {counted(len(stack.trials), 'trial')} of {experiment}")

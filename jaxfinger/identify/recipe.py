@@ -1,8 +1,10 @@
 """Recipes: the choices of a fit that change from one finger to another, in a TOML file without unknown keys."""
 
+import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from jaxfinger.data.session import EXPERIMENT_NAMES
 from jaxfinger.data.toml import Fault, OneOf, Place, Within, read_toml
@@ -58,18 +60,24 @@ class Recipe:
     validation: ValidationRecipe = field(default_factory=ValidationRecipe)
 
 
-def read_recipe(path: str | Path | None) -> Recipe:
+def read_recipe(path: str | os.PathLike | Mapping[str, Any] | None) -> Recipe:
     """Read a recipe from a TOML file, or a shipped one by its name; for None, the paper's.
+
+    In place of a file, dictionaries may hold its keys (docs/how-to-choose.md). Those that are left out are the paper's.
 
     >>> import jaxfinger as jf
     >>> jf.recipe("emps").model.terms
     ('joint_elastic', 'joint_coulomb', 'joint_damping')
+    >>> jf.recipe({"name": "stiffer", "model": {"elastic_degree": 4}}).model.elastic_degree
+    4
 
     Raises:
         UserError: there is no such recipe, or a key of it is wrong; it names the key to mend.
     """
     if path is None:
         return Recipe()
+    if isinstance(path, Mapping):
+        return structure(dict(path), "the recipe")
     path = Path(path)
     if not path.exists():
         path = _shipped(path.name) or path
@@ -90,6 +98,15 @@ def structure(content: dict, where: str) -> Recipe:
         UserError: a key is unknown or its value is not allowed.
     """
     return from_tables(content, Recipe, Place(where))
+
+
+def checked(recipe: Recipe) -> Recipe:
+    """The recipe, which Python may have made, with the checks of a file.
+
+    Raises:
+        UserError: a value is not allowed.
+    """
+    return structure(as_dict(recipe), f"recipe {recipe.name!r}")
 
 
 def as_dict(recipe: Recipe) -> dict:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxfinger.compilation import one_blas_thread, quick_jit
 from jaxfinger.data import Session
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, chosen, require
 from jaxfinger.experiments import Batch, Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import scaled_directions
@@ -95,9 +95,9 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
     Raises:
         UserError: the fit was not made from this session.
     """
-    kinds = (to,) if isinstance(to, str) else tuple(to)
-    if unknown := set(kinds) - set(KINDS):
-        raise UserError(f"sensitivity to {sorted(unknown)}: it takes some of {list(KINDS)}")
+    require(Fit, fit=fit)
+    require(Session, session=session)
+    kinds = chosen(to, KINDS, "kind of data")
     model_for(fit, session)  # raises for a session of another finger
     parameters, plan = describe(fit.model), plan_of(session, fit)
     names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]

@@ -4,7 +4,7 @@ Each stage fits equation (1) to experiments in which some of its terms vanish, a
 others. The parameters of earlier stages stay fixed, and their errors are propagated (`propagate`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.data.signals.sizes import sizes_of
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, chosen, require
 from jaxfinger.experiments import Experiment, Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport
 from jaxfinger.identify.identifiability import name_invisible, name_traded
@@ -29,7 +29,7 @@ from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
-from jaxfinger.identify.recipe import Recipe
+from jaxfinger.identify.recipe import Recipe, checked
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import (
     ROUGH_TOLERANCE,
@@ -190,14 +190,15 @@ def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], fre
 def identify(
     session: Session,
     recipe: Recipe | None = None,
-    stages: tuple[str, ...] | None = None,
+    stages: str | Sequence[str] | None = None,
     start: Fit | None = None,
     progress: Progress = lambda message: None,
     stacks: dict[str, Stack] | None = None,
 ) -> Fit:
     """Run the staged fits on a session. A stage whose trials are missing is reported as skipped.
 
-    `recipe`: by default that of `start`, else the paper's. `stages`: names of those to run, by default the recipe's.
+    `recipe`: by default that of `start`, else the paper's. `stages`: name or names of those to run (`STAGES`), by
+    default the recipe's.
     `start`: a fit with the parameters of earlier stages; its recipe is the recipe of its terms. `progress`: called with
     a sentence at each step. `stacks`: the session's trials, where `prepare` has read them already.
 
@@ -210,12 +211,16 @@ def identify(
     '95 ± 0.9 kg'
 
     Raises:
-        UserError: `recipe` is another than that of `start`, or `start` is a fit of another finger.
+        UserError: `recipe` is another than that of `start`, or one of its values is not allowed; `start` is a fit of
+            another finger; or there is no such stage.
     """
+    require(Session, session=session)
+    require((Recipe, None), recipe=recipe)
+    require((Fit, None), start=start)
     if start is not None and recipe not in (None, start.recipe):
         raise UserError("a fit to start from brings its own recipe; leave out `recipe` or `start`")
-    recipe = recipe or (start.recipe if start else Recipe())
-    wanted = stages or recipe.fit.stages
+    recipe = checked(recipe) if recipe else start.recipe if start else Recipe()
+    wanted = chosen(stages or recipe.fit.stages, STAGES, "stage")
     if start is None:
         fit = Fit.before(session, recipe, nominal_model(session, recipe))
         fit = replace(fit, covariance=covariance_before(session, recipe, describe(fit.model)))
@@ -236,7 +241,7 @@ def identify(
     return fit
 
 
-def _noise_here(start: Fit, session: Session, stages: tuple[str, ...]) -> dict[tuple[str, str], Noise]:
+def _noise_here(start: Fit, session: Session, stages: Sequence[str]) -> dict[tuple[str, str], Noise]:
     """Noise of a fit to start from, without that which other sensors may have had in trials that these stages read."""
     if start.was_made_from(session):
         return start.noise

@@ -33,11 +33,11 @@ class Samples:
 
     @property
     def covariance(self) -> Float[np.ndarray, "P P"]:
-        """Sample covariance of the members that did not fail."""
+        """Sample covariance of the members that did not fail, in SI units."""
         return np.cov(self.values[~self.failed], rowvar=False)
 
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 P"]:
-        """Lower and upper bound of the central interval of every parameter, as percentiles."""
+        """Lower and upper bound of the central interval of every parameter, as percentiles, in SI units."""
         tail = 50 * (1 - level)
         return np.percentile(self.values[~self.failed], [tail, 100 - tail], axis=0)
 
@@ -51,10 +51,17 @@ def bootstrap(
     batching: Batching | None = None,
     compressed: Compressed | None = None,
 ) -> Samples:
-    """Refit to resampled trials of the session that the fit was made from.
+    """Refit to resampled trials of the session that the fit was made from; no sample is read or linearised again.
 
     Parameters that CAD gives and no stage estimates are drawn from their own distribution, since trials do not show
-    their errors. `compressed`: the result of `compress(session, fit)`, where it is known.
+    their errors. `batching`: as in `resample.refit`. `compressed`: the result of `compress(session, fit)`, where it is
+    known.
+
+    Returns:
+        The flat vectors of the resamples, in SI units, in the order of `parameters.describe`.
+
+    Raises:
+        UserError: the session lacks the trials of the fit, or the fit was refined with `ahead`.
     """
     compressed = compressed or compress(session, fit)
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ is arbitrary. Their mean error, like the paper's, is relative to the trial's fir
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from html import escape
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
-from jaxfinger.errors import UserError
+from jaxfinger.errors import UserError, chosen, require
 from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, predict_compiled, prepare
 from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
@@ -101,10 +101,10 @@ class Validation:
 def validate(
     fit: Fit,
     session: Session,
-    experiments: tuple[str, ...] | None = None,
+    experiments: str | Sequence[str] | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Validation:
-    """Score a fit on the trials of the recipe's validation experiments, or on those of `experiments`.
+    """Score a fit on the trials of the recipe's validation experiments, or on those of `experiments`, one or more.
 
     >>> import jaxfinger as jf
     >>> validation = jf.validate(jf.load("fit.json"), jf.read("session.h5"))
@@ -117,8 +117,10 @@ def validate(
     Raises:
         UserError: the session has no trial of these experiments, or is of another finger.
     """
+    require(Fit, fit=fit)
+    require(Session, session=session)
     model = model_for(fit, session)
-    wanted = experiments or fit.recipe.validation.experiments
+    wanted = chosen(experiments or fit.recipe.validation.experiments, EXPERIMENTS, "experiment")
     stacks = readings_of(session, [t.name for t in session if t.experiment in wanted])
     if not stacks:
         has = ", ".join(dict.fromkeys(t.experiment for t in session)) or "no trials"

@@ -1,9 +1,10 @@
 """Every effect of the catalogue is absent at zero and differentiable there, and is written and read at every site."""
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -11,7 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, Scales, from_dict, load, nominal_terms, to_dict
+from jaxfinger.effects import (
+    CATALOGUE,
+    CHANGED,
+    NOMINAL_TERMS,
+    Scales,
+    from_dict,
+    load,
+    nominal_terms,
+    own_effects,
+    to_dict,
+)
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import EXPERIMENTS, Batch, affected_channels, change, predict, refuse_broken
 from jaxfinger.identify.parameters import describe, units_at
@@ -383,6 +394,29 @@ def test_an_effect_that_cannot_work_is_refused_in_a_sentence(tmp_path, right, wr
     path.write_text(DRAG.replace(right, wrong, 1))
     with pytest.raises(UserError, match=complaint):
         refuse_broken(next(iter(load(path).values())), FINGER)
+
+
+def test_classes_are_checked_as_a_file_is(tmp_path):
+    path = tmp_path / "drag.py"
+    path.write_text(DRAG)
+    (drag,) = load(path).values()
+    assert own_effects(path).keys() == own_effects({"joint_drag": drag}).keys() == {"joint_drag"}
+    assert own_effects(None) == {}
+    with pytest.raises(UserError, match="JointDrag has the ID joint_drag, not drag"):
+        own_effects({"drag": drag})
+    with pytest.raises(UserError, match="which the catalogue has"):
+        own_effects({"joint_damping": type("Mine", (drag,), {"ID": "joint_damping"})})
+
+
+def test_an_effect_that_was_typed_into_a_notebook_is_refused_in_a_sentence(tmp_path, monkeypatch):
+    """Its module has no file."""
+    path = tmp_path / "drag.py"
+    path.write_text(DRAG.replace("jnp.abs", "jnp.nothing"))
+    (drag,) = load(path).values()
+    monkeypatch.setattr(drag, "__module__", "__main__")
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))
+    with pytest.raises(UserError, match="__main__: joint_drag fails in a prediction"):
+        refuse_broken(drag, FINGER)
 
 
 # Letters that stand for these names in a formula.

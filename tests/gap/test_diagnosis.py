@@ -15,7 +15,10 @@ from jaxfinger.gap.parts import channels_not_judged
 from jaxfinger.gap.result import Key, NotJudged, Reason
 from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
+from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.noise import whiten
+from jaxfinger.identify.stages import nominal_model
+from jaxfinger.report.sentences import summary
 
 from .conftest import PLANTED, RIVALS, TRUTH, WITHOUT, session_with
 
@@ -187,16 +190,29 @@ def test_no_place_stands_out_of_white_noise(planted):
     assert where(replace(planted, r=np.random.default_rng(2).standard_normal(planted.r.size))) == []
 
 
-@pytest.mark.parametrize(("measured", "reason"), [(False, Reason.NOT_MEASURED), (True, Reason.FEW_SAMPLES)])
-def test_a_session_in_which_too_few_samples_count_is_not_judged(measured, reason):
-    """Three seconds of ID.2 are 30 rows of a first look, and a column has 50 at least."""
+def three_seconds(measured=True):
+    """A session of three seconds of ID.2: 30 rows of a first look, where a column has 50 at least."""
     session = session_with()
     trial = next(iter(session.select("ID.2")))
     arrays = {f.name: getattr(trial, f.name) for f in fields(trial)}
     short = replace(trial, **{k: x[:300] for k, x in arrays.items() if isinstance(x, np.ndarray)})
     if not measured:
         short = replace(short, tendon_excursion=np.full_like(short.tendon_excursion, np.nan))
-    found = diagnose(replace(session, trials={short.name: short}), without=WITHOUT, quick=True)
+    return replace(session, trials={short.name: short})
+
+
+def test_the_data_of_a_fit_of_the_session_itself_are_said_to_count_twice():
+    session, other = three_seconds(), session_with(seed=9)
+    said = []
+    for of in (session, other):
+        fit = Fit.before(of, Recipe(), nominal_model(of, Recipe()))
+        said.append(summary(diagnose(session, without=WITHOUT, quick=True, against=fit)))
+    assert ["was made from this session, whose data then count twice" in x for x in said] == [True, False]
+
+
+@pytest.mark.parametrize(("measured", "reason"), [(False, Reason.NOT_MEASURED), (True, Reason.FEW_SAMPLES)])
+def test_a_session_in_which_too_few_samples_count_is_not_judged(measured, reason):
+    found = diagnose(three_seconds(measured), without=WITHOUT, quick=True)
     assert found.status is Status.NOT_JUDGED
     assert found.not_judged == (NotJudged("ID.2", "tendon_excursion", reason),)
     assert not found.named
