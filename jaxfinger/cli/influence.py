@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxfinger.cli.output import print_json, progress, refuse_figure, table
+from jaxfinger.cli.output import print_json, progress, refuse_effects, refuse_figure, table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,6 +42,7 @@ def influence(
     """
     if figure is not None:
         refuse_figure(figure, overwrite)
+    refuse_effects(fit)
     from jaxfinger.data import read_session
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.parameters import describe

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxfinger.cli.output import Output, print_json, progress, read, refuse_output
+from jaxfinger.cli.output import Output, print_json, progress, read, refuse_effects, refuse_output
 from jaxfinger.errors import UserError, counted
 from jaxfinger.fit_content import read_content
 
@@ -69,10 +69,17 @@ def identify(
 
 
 def _fit(
-    stages: tuple[str, ...], file: Path, output: Path, start: Path | None, recipe: str | None, json: bool, overwrite
+    stages: tuple[str, ...],
+    file: Path,
+    output: Path,
+    start: Path | None,
+    effects: Path | None,
+    recipe: str | None,
+    json: bool,
+    overwrite: bool,
 ):
     """Run some stages of the identification on a session, write the fit and print it."""
-    refuse_output(output, overwrite, file, start, recipe)
+    refuse_output(output, overwrite, file, start, effects, recipe)
     if start is not None and recipe is not None:
         raise UserError(f"{start}: a fit to start from brings its own recipe; leave out --recipe or --start")
     from jaxfinger.identify import identify as run
@@ -81,7 +88,7 @@ def _fit(
     with progress("fit") as say:
         say("reading the file")
         session = read(file)
-        first = load_fit(start) if start else None
+        first = load_fit(start, effects) if start else None
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
         if all(s.status == "skipped" for s in fit.stages):
             raise UserError(
@@ -99,11 +106,12 @@ def _stage_command(name: str, stages: tuple[str, ...], summary: str):
         *,
         output: Output,
         start: Path | None = None,
+        effects: Path | None = None,
         recipe: str | None = None,
         json: bool = False,
         overwrite: bool = False,
     ) -> None:
-        _fit(stages, file, output, start, recipe, json, overwrite)
+        _fit(stages, file, output, start, effects, recipe, json, overwrite)
 
     command.__name__ = name
     command.__doc__ = f"""{summary}
@@ -116,6 +124,8 @@ def _stage_command(name: str, stages: tuple[str, ...], summary: str):
         Fit to write (JSON).
     start
         A fit that holds the other parameters.
+    effects
+        The Python file of effects of your own, where that fit's model has some.
     recipe
         What to fit (TOML), without --start.
     json
@@ -139,6 +149,7 @@ def fit_id4(
     *,
     output: Output,
     start: Path,
+    effects: Path | None = None,
     json: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -152,12 +163,14 @@ def fit_id4(
         Fit to write (JSON).
     start
         A fit of ID.2 and ID.3.
+    effects
+        The Python file of effects of your own, where that fit's model has some.
     json
         Print the parameters as JSON.
     overwrite
         Replace a file that is already there.
     """
-    _fit(("ID.4",), file, output, start, None, json, overwrite)
+    _fit(("ID.4",), file, output, start, effects, None, json, overwrite)
 
 
 def fit_joint(
@@ -181,6 +194,7 @@ def fit_joint(
         Replace a file that is already there.
     """
     refuse_output(output, overwrite, file, start)
+    refuse_effects(start)
     from jaxfinger.identify import load_fit
 
     with progress("fit") as say:

@@ -182,6 +182,14 @@ def refuse_output(path: Path, overwrite: bool, *reads: str | Path | None) -> Non
         raise UserError(f"{path.parent}: is no folder; make it first")
 
 
+def refuse_effects(fit: Path) -> None:
+    """Refuse a fit whose model has effects, before any work is done."""
+    from jaxfinger.fit_content import read_content
+
+    if read_content(fit).get("effects"):
+        raise UserError(f"{fit}: its model has effects; give a fit of the nominal model, as `identify` writes it")
+
+
 def refuse_figure(path: Path, overwrite: bool) -> None:
     """Refuse a picture that is neither .svg nor .png, cannot be written or may not be replaced."""
     if path.suffix not in FIGURES:

@@ -150,7 +150,8 @@ def from_dict(finger: Finger, content: dict, extra: dict[str, type[CatalogueEffe
     known = CATALOGUE | NOMINAL_TERMS | CHANGED | (extra or {})
     if content["effect"] not in known:
         raise UserError(
-            f"the effect {content['effect']!r} is not in the catalogue; name the file that defines it with --effects"
+            f"the effect {content['effect']!r} is not in the catalogue; name the Python file that defines it by "
+            "--effects, in Python by `effects`"
         )
     values = {k: v["value"] for k, v in content["parameters"].items()}
     return known[content["effect"]].at(finger, tuple(content["site"]), **values)

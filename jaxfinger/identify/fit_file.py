@@ -72,7 +72,8 @@ def load_fit(path: str | os.PathLike, effects: str | os.PathLike | None = None) 
     Fit('EMPS', recipe 'emps': 4 parameters; ID.3-dynamic fitted)
 
     Raises:
-        UserError: the file cannot be read, is no fit, or has been damaged.
+        UserError: the file cannot be read, is no fit, has been damaged, or its model has an effect that neither the
+            catalogue nor `effects` has.
     """
     content = read_content(path)
     try:
@@ -123,7 +124,7 @@ def _arrays(module) -> dict[str, list]:
 
 
 def _from_dict(content: dict[str, Any], path: str, effects: str | os.PathLike | None) -> Fit:
-    model = _model(content, effects)
+    model = _model(content, path, effects)
     position = {p.name: i for i, p in enumerate(describe(model))}
     rows = np.array([position[name] for name in content["covariance"]["names"]], dtype=int)
     block = np.array(content["covariance"]["matrix"], dtype=float).reshape(rows.size, rows.size)
@@ -140,7 +141,7 @@ def _from_dict(content: dict[str, Any], path: str, effects: str | os.PathLike | 
     )
 
 
-def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
+def _model(content: dict[str, Any], path: str, effects: str | os.PathLike | None) -> Model:
     f, arm = content["finger"], content["moment_arm"]
     m, n = len(f["joint_names"]), len(f["tendon_names"])
     size: dict[Any, Any] = {"m": m, "n": n}
@@ -159,7 +160,10 @@ def _model(content: dict[str, Any], effects: str | os.PathLike | None) -> Model:
     )
     if content["effects"]:
         own = load(effects) if effects is not None else {}
-        known = tuple(from_dict(finger, e, own) for e in content["effects"])
+        try:
+            known = tuple(from_dict(finger, e, own) for e in content["effects"])
+        except UserError as e:
+            raise UserError(f"{path}: {e}") from None
         model = Model(finger, model.moment_arm, model.joint_torque, model.tendon_friction, known)
     return model
 

@@ -60,13 +60,15 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
 
     Raises:
         UserError: the session has none of these trials, or is of another finger; or `ahead` is given and there is no
-            VD.3 trial, or the fit has effects.
+            VD.3 trial; or the fit has effects, whose shapes have bounds that the refinement does not know.
     """
     require(Session, session=session)
     require(Fit, fit=fit)
     recipe = fit.recipe
-    if ahead and fit.model.effects:
-        raise UserError("a fit with effects cannot be refined ahead; give one of the nominal model")
+    if fit.model.effects:
+        raise UserError(
+            "a fit with effects cannot be refined; give one of the nominal model, or fit them by `fit effects`"
+        )
     model = start = model_for(fit, session)
     starts = shooting(session) if ahead else None
     progress("reading the recordings")

@@ -114,14 +114,16 @@ def plan_of(session: Session, fit: Fit) -> Plan:
 
     Raises:
         UserError: the session lacks the trials of a stage; or the fit was refined with `ahead`, whose simulations
-            cannot be refitted; or no stage was fitted.
+            cannot be refitted, or by a diagnosis, whose weights differ; or no stage was fitted.
     """
     parameters, file = describe(fit.model), session.file or "the session"
     done = [s.name for s in fit.stages if s.status != "skipped"]
     if not done:
         raise UserError(f"{file}: no stage of the fit was fitted, so no parameter depends on a trial")
-    if done[-1:] == [AHEAD]:
+    if done[-1] == AHEAD:
         raise UserError(f"{file}: the fit was refined with --ahead; give one without it")
+    if done[-1] != JOINT and not {*STAGES, JOINT, AHEAD}.issuperset(done):
+        raise UserError(f"{file}: the fit is one of a diagnosis; give one that `identify` or `fit joint` wrote")
     experiments = fit.recipe.fit.joint_experiments
     needed = experiments if JOINT in done else [name for name in done if name in STAGES]
     lacking = [e for e in needed if all(t.experiment != e for t in session)]

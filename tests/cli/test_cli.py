@@ -15,6 +15,11 @@ import pytest
 from jaxfinger import cli
 from jaxfinger.cli import main, tables
 from jaxfinger.cli.app import COMMANDS, SEALED, STAGES
+from jaxfinger.data import read_session
+from jaxfinger.effects import CATALOGUE
+from jaxfinger.errors import UserError
+from jaxfinger.identify import Fit, Recipe, load_fit, refine, save_fit
+from jaxfinger.identify.stages import nominal_model
 from jaxfinger.report.numbers import number
 
 ROOT = Path(__file__).parents[2]
@@ -455,3 +460,24 @@ def test_what_a_command_needs_is_said_in_a_sentence(tokens, says, capsys):
         main(tokens)
     assert end.value.code == 2
     assert " ".join(capsys.readouterr().err.split()) == f"jaxfinger: {says}"
+
+
+def test_a_fit_with_effects_is_refused_before_any_work_where_it_is_of_no_use(tmp_path, capsys):
+    session = read_session(DEMO)
+    fit = Fit.before(session, Recipe(), nominal_model(session, Recipe()))
+    stretch = CATALOGUE["tendon_stretch"].at(fit.model.finger, ("T3",))
+    save_fit(fit.with_effect(stretch, ("compliance",)), tmp_path / "fit.json")
+    for command in (
+        ("influence", tmp_path / "fit.json", DEMO),
+        ("fit", "joint", DEMO, "--start", tmp_path / "fit.json"),
+    ):
+        more = ("-o", tmp_path / "out.json") if command[0] == "fit" else ()
+        assert run(*command, *more) != 0
+        assert f"{tmp_path / 'fit.json'}: its model has effects; give a fit of the nominal" in capsys.readouterr().err
+    with pytest.raises(UserError, match="a fit with effects cannot be refined"):
+        refine(session, load_fit(tmp_path / "fit.json"))
+    # One that neither the catalogue nor a file has is named with the fit's file.
+    text = (tmp_path / "fit.json").read_text()
+    (tmp_path / "own.json").write_text(text.replace("tendon_stretch", "my_stretch"))
+    assert run("fit", "id4", DEMO, "--start", tmp_path / "own.json", "-o", tmp_path / "out.json") != 0
+    assert f"{tmp_path / 'own.json'}: the effect 'my_stretch' is not in the catalogue" in capsys.readouterr().err

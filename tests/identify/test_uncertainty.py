@@ -1,5 +1,6 @@
 """Bootstrap and sandwich from compressed trials, against refits by SciPy and against Laplace's covariance."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,8 +9,27 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfinger.identify import bootstrap, compress, identifiability, refit, robust, sandwich
+from jaxfinger.errors import UserError
+from jaxfinger.identify import (
+    StageReport,
+    bootstrap,
+    compress,
+    fit_many,
+    identifiability,
+    refit,
+    robust,
+    sandwich,
+    sensitivity,
+)
 from jaxfinger.identify.uncertainty import draw_weights
+
+
+def sensitivity_to_trials(session, fit):
+    return sensitivity(fit, session, "trials")
+
+
+def fit_again(session, fit):
+    return fit_many([session], fit, session)
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +125,14 @@ def test_robust_covariance_is_never_narrower(session, staged):
     wide = robust(session, staged)
     assert np.all(wide.std >= staged.std * (1 - 1e-12))
     assert np.linalg.eigvalsh(wide.covariance).min() > -1e-12 * wide.covariance.max()
+
+
+@pytest.mark.parametrize("of", [bootstrap, sensitivity_to_trials, fit_again], ids=lambda f: f.__name__)
+def test_a_fit_of_a_diagnosis_is_refused(session, staged, of):
+    """Its trials have other weights than those of a fit of stages, so that no refit of these is one of it."""
+    diagnosed = replace(staged, stages=(*staged.stages, StageReport("all trials", "fitted")))
+    with pytest.raises(UserError, match="is one of a diagnosis; give one that `identify` or `fit joint` wrote"):
+        of(session, diagnosed)
 
 
 def test_the_session_sees_every_parameter(session, staged, compressed):
