@@ -188,7 +188,7 @@ def refit(
 def variances(compressed: Compressed) -> Float[np.ndarray, "2 P"]:
     """Variances in SI units of all trials' fit: those that their noise alone makes, and those that z_0 makes."""
     covariance = np.asarray(_covariance(compressed.grams, compressed.sizes))
-    return variance_parts(compressed.basis, covariance, compressed.sizes[0])
+    return np.asarray(variance_parts(compressed.basis, covariance, compressed.sizes[0]))
 
 
 def variance_parts(

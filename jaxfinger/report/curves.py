@@ -121,9 +121,9 @@ def model_curves(fit: Fit, session: Session | None = None) -> Curves:
         {
             j: JointCurves(
                 *(Curve(swept[i, i] * angle[i], *(a[k, i] * torque[i] for a in torques)) for k in range(4)),
-                gravity[i, i] * torque[i],
-                (float(damping[0][i] * torque[i]), float(damping[1][i] * torque[i])),
-                finger.prismatic[i],
+                gravity=gravity[i, i] * torque[i],
+                damping=(float(damping[0][i] * torque[i]), float(damping[1][i] * torque[i])),
+                prismatic=finger.prismatic[i],
             )
             for i, j in enumerate(finger.joint_names)
             if j in estimated
