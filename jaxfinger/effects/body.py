@@ -68,9 +68,9 @@ class GravityTilt(CatalogueEffect):
     LOOKS: ClassVar = "The weight torques of all joints are off together, as under one turned gravity vector."
     CHANGE: ClassVar = "Measure the mounting with a level, and correct `gravity` of the finger."
 
-    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
-    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
-    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
+    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
+    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
 
     def finger(self, finger):
         tilt = jnp.stack([self.x, self.y, self.z])

@@ -141,9 +141,9 @@ class ForceSensorRotation(CatalogueEffect):
     LOOKS: ClassVar = "A force in one direction shows in another, in proportion."
     CHANGE: ClassVar = "Measure how the sensor is mounted, and turn its readings."
 
-    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
-    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
-    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True)
+    x: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
+    y: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
+    z: Float[Array, ""] = amplitude("rad", 0.06, signed=True, most=jnp.pi)
 
     def reading(self, channel, x, y):
         if channel != "fingertip_force":

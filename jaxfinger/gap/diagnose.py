@@ -118,12 +118,12 @@ def diagnose(
     if predictions is not None and not isinstance(predictions, CheckedPredictions):
         predictions = checked(session, predictions, session.file or "the session")
     told, doubts = predictions or (None, ())
-    sentences = [x.sentence for x in doubts]
-    if against is not None and against.was_made_from(session):
-        sentences.append("the earlier fit was made from this session, whose data then count twice")
 
     # The nominal model, and what it misses.
     problem = build(session, recipe, progress, told, COARSE if quick else 1, against)
+    sentences = [x.sentence for x in doubts]
+    if against is not None and against.was_made_from(session):
+        sentences.append("the earlier fit was made from this session, whose data then count twice")
     diagnosis = partial(
         Diagnosis,
         data=Path(session.file).name if session.file else "",

@@ -116,7 +116,8 @@ def table_of(problem: Problem, baseline: Baseline, parts: Iterable[Part], togeth
     read = [part.variant_rows(project, rt, baseline.columns) for part in parts]
     items = [v for some, _ in read for v in some]
     signatures = ByColumn.joined(baseline.columns, [rows for _, rows in read])
-    norm, left, units, share = _visibility(baseline, project, signatures)
+    most = np.array([v.effect.amplitudes()[n].most / size for v in items for n, size in v.sizes.items()])
+    norm, left, units, share = _visibility(baseline, project, signatures, most)
     seen = units > 0.0
     absorbed: dict[CauseKey, float] = {}
     hidden: dict[CauseKey, dict[str, float]] = {}
@@ -148,14 +149,16 @@ class Visibility(NamedTuple):
 
     norm: Float[np.ndarray, " M"]  # ‖z‖, zero where it is rounding
     left: Float[np.ndarray, " M"]  # ‖z − Q Qᵀ z‖, what the nominal parameters leave
-    units: Float[np.ndarray, " M"]  # amplitude at which what is left is as large as the gap; zero: not visible
+    # Amplitude at which what is left is as large as the gap, or the largest allowed one; zero: not visible.
+    units: Float[np.ndarray, " M"]
     share: Float[np.ndarray, "M C"]  # of each column's gap, that the signature would explain at that amplitude
 
 
-def _visibility(baseline: Baseline, project: Projector, Z: ByColumn) -> Visibility:
+def _visibility(baseline: Baseline, project: Projector, Z: ByColumn, most: Float[np.ndarray, " M"]) -> Visibility:
     """Compare signatures with what the nominal parameters, which Q spans, leave of them.
 
-    With orthonormal Q, ‖z − Q Qᵀ z‖² = ‖z‖² − ‖Qᵀ z‖².
+    With orthonormal Q, ‖z − Q Qᵀ z‖² = ‖z‖² − ‖Qᵀ z‖². An amplitude is at most `most`; what stays below the noise even
+    there is not visible.
     """
     columns, Q = baseline.columns, project.Q
     square, onto = np.zeros(Z.count), np.zeros((Q.shape[1], Z.count))
@@ -165,7 +168,8 @@ def _visibility(baseline: Baseline, project: Projector, Z: ByColumn) -> Visibili
     square[square < MIN_NORM**2] = 0.0
     rest = square - np.sum(onto**2, axis=0)
     norm, left = np.sqrt(square), np.sqrt(np.where(rest > MIN_UNABSORBED_ENERGY * square, rest, 0.0))
-    units = np.where(left > MIN_UNABSORBED * norm, baseline.gap / np.maximum(left, 1e-300), 0.0)
+    units = np.minimum(baseline.gap / np.maximum(left, 1e-300), most)
+    units = np.where((left > MIN_UNABSORBED * norm) & (left > 1.0 / most), units, 0.0)
     absorbed = np.concatenate([c.basis.T @ Q[c.rows] for c in columns.items]) @ onto
     energy = columns.sums((Z.B - absorbed) ** 2).T
     share = units[:, None] ** 2 * energy / np.maximum(baseline.null.linear_fit.evidence.e, 1e-300)

@@ -113,3 +113,19 @@ def test_a_signature_of_rounding_is_not_seen(planted):
     table = table_of(planted, baseline, [rounding])
     assert table.offers == []
     assert table.absorbed == {}
+
+
+def test_an_amplitude_is_expected_no_larger_than_allowed(planted):
+    """Of a tilt the finger's plane shows little, so that it might fill the gap after many turns only."""
+    baseline = Baseline.of(planted, Parameters())
+    kinds = {k: CATALOGUE[k] for k in ("gravity_tilt", "tendon_backlash", "joint_presliding")}
+    items = variants(kinds, planted.nominal.finger, planted.scales)
+    table = table_of(planted, baseline, read_parts(planted, items, baseline.columns))
+    expected = [
+        (table.units[i] * size, v.effect.amplitudes()[n].most)
+        for v, at in table.rows.items()
+        for i, (n, size) in zip(at, v.sizes.items(), strict=True)
+    ]
+    assert all(unit <= most * (1.0 + 1e-9) for unit, most in expected)
+    assert any(unit == pytest.approx(most) for unit, most in expected)
+    assert {key[0] for key in table.keys} == set(kinds)
