@@ -229,8 +229,9 @@ def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
         if channel not in channels:
             near, known = did_you_mean(channel, channels), ", ".join(channels)
             raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
+        said = f"{share:g}" if isinstance(share, Real) else repr(share)
         if not isinstance(share, Real) or not 0.0 <= share < 1.0:
-            raise UserError(f"tolerance of {channel}: is {share!r}; say a share of its signal, such as 0.02")
+            raise UserError(f"tolerance of {channel}: is {said}; say a share of its signal, such as 0.02")
 
 
 def _nothing_judged(problem: Problem, diagnosis: Callable[..., Diagnosis]) -> Diagnosis:
