@@ -145,6 +145,11 @@ def percent(share: float) -> str:
     return f"{round(value)} %"  # An integer has no minus zero.
 
 
+def chance(probability: float) -> str:
+    """A probability as `percent` says it, but for one that is rounded to certainty, as no probability is."""
+    return "over 99 %" if probability >= 0.995 else percent(probability)
+
+
 def percent_range(low: float, high: float) -> str:
     """An interval of shares: «35 to 47 %»."""
     return f"{round(100 * low)} to {round(100 * high)} %"

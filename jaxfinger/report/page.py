@@ -20,7 +20,7 @@ from jaxfinger.report.causes import words
 from jaxfinger.report.curves import Curves, model_curves
 from jaxfinger.report.measured import arm_points
 from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, effect_name, joined, key_name, site_names
-from jaxfinger.report.numbers import HALF_95, measured, percent, quantity, unbroken
+from jaxfinger.report.numbers import HALF_95, chance, measured, percent, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -88,7 +88,7 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
         rivals=[sentences.sentence(sentences.cannot_tell(s)) for s in d.ambiguous_sets if d.status is Status.PARTLY],
         changes=[change(x) for x in d.changes[:MAX_CHANGES]],
         changed="What the measurements say of the simulator's parameters" if simulator else "What has changed",
-        others=[{"name": key_name(c.key), "probability": percent(c.probability)} for c in others],
+        others=[{"name": key_name(c.key), "probability": chance(c.probability)} for c in others],
         places=[_place(p, prismatic) for p in d.where if p.share >= MIN_PLACE_SHARE],
         trace=_trace(trace) if trace else "",
         trace_name=f"{trace.trial}: {trace.name}" if trace else "",
@@ -236,7 +236,7 @@ def _cards(d: Diagnosis) -> list[dict]:
 
 
 def _card(d: Diagnosis, k: int, c: Cause) -> dict:
-    says = f"{sentences.shared(d, c, ' of the gap')}; probability {percent(c.probability)}."
+    says = f"{sentences.shared(d, c, ' of the gap')}; probability {chance(c.probability)}."
     return _texts(d, k, c.effect) | {
         "name": sentences.sentence(cause_name(c)).rstrip("."),
         "says": says,
@@ -247,7 +247,7 @@ def _card(d: Diagnosis, k: int, c: Cause) -> dict:
 def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
     return _texts(d, k, key.effect) | {
         "name": sentences.sentence(key_name(key)).rstrip("."),
-        "says": f"Probability {percent(c.probability)}." if c else "",
+        "says": f"Probability {chance(c.probability)}." if c else "",
         "sizes": [_value(v, False) for v in c.values] if c else [],
     }
 

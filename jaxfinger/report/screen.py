@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
 from jaxfinger.report.names import cause_name, channel_name, effect_name, key_name, site_names
-from jaxfinger.report.numbers import measured, percent, quantity, unbroken
+from jaxfinger.report.numbers import chance, measured, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
 
 WIDTH, BAR = 100, 30  # Characters in a line and in a bar; beside the bar a channel's name must fit.
@@ -58,7 +58,7 @@ def _in_session(key: Key, d: Diagnosis) -> str:
     if found is None:
         return "not visible"
     sizes = [f", {v.name} {measured(v.value, v.std, v.units)}" for v in found.values[:1] if key in d.named]
-    return percent(found.probability) + "".join(sizes)
+    return chance(found.probability) + "".join(sizes)
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
@@ -93,7 +93,7 @@ def _legend(d: Diagnosis) -> str:
 
 
 def _cause(d: Diagnosis, k: int, c: Cause) -> list[str]:
-    says = f"{sentences.shared(d, c)}, probability {percent(c.probability)}"
+    says = f"{sentences.shared(d, c)}, probability {chance(c.probability)}"
     at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
     values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
     first, *rest = _wrapped(f"{SIGNS[k % len(SIGNS)]} {cause_name(c)}: {says}", "  ")
@@ -105,7 +105,7 @@ def _not_named(effect: str, d: Diagnosis) -> str:
     name = effect_name(effect)
     if tried := [c for c in d.candidates if c.key.effect == effect]:
         likeliest = max(tried, key=lambda c: c.probability)
-        return f"  {name}: probability {percent(likeliest.probability)} at {site_names([likeliest.key.site])}"
+        return f"  {name}: probability {chance(likeliest.probability)} at {site_names([likeliest.key.site])}"
     if any(x.key.effect == effect for x in d.absorbed):
         return f"  {name}: the model's own parameters imitate it in these trials"
     return f"  {name}: no trial shows it"

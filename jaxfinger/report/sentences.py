@@ -28,7 +28,7 @@ from jaxfinger.gap.result import (
     still_open,
 )
 from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, joined, key_name
-from jaxfinger.report.numbers import MAX_CHI2, alike, measured, number, percent, percent_range, quantity
+from jaxfinger.report.numbers import MAX_CHI2, alike, chance, measured, number, percent, percent_range, quantity
 
 MAX_NAMES = 4  # Causes or channels in one sentence; more make it hard to read, and the page lists all.
 # Share of a gap: with more left, what is named may imitate a law that nobody listed. Imitators left 28 to 48 %, true
@@ -165,20 +165,20 @@ def is_simulator(d: Diagnosis) -> bool:
 
 
 def _no_gap(d: Diagnosis) -> list[str]:
-    chance = f"the probability that nothing is at work beyond it is {percent(d.none)}"
+    doubt = f"the probability that nothing is at work beyond it is {chance(d.none)}"
     if tolerated(d):
-        return [size(d), chance if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
+        return [size(d), doubt if d.none >= 0.5 else "nothing is missed by more than you tolerate"]
     if d.unlisted >= MIN_NAMED_PROBABILITY:
-        chance = "all trials together hold traces of something more, too small for any channel to show alone"
+        doubt = "all trials together hold traces of something more, too small for any channel to show alone"
     judged = [x for x in d.closures if x.channel != "q"]  # Simulated angles are not judged by their noise.
     loud = [x for x in judged if 0.0 < MAX_CHI2 * x.noise**2 < x.after**2]
     if not loud:
-        return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", chance]
+        return [f"{_subject(d)} predicts {_counted(len(judged))} to within the noise", doubt]
     names = [f"{channel_name(x.channel)} of {x.experiment} ({number(x.after / x.noise, 2)} times)" for x in loud]
     return [
         f"{_subject(d)} leaves in {_counted(len(judged))} nothing that a law could explain",
         f"what it leaves is larger than the channel's own noise in {joined(names)}, as where {_why_loud(d, loud)}",
-        chance,
+        doubt,
     ]
 
 
@@ -250,7 +250,7 @@ def _ambiguous(d: Diagnosis) -> list[str]:
     text = cannot_tell(d.ambiguous_sets[0] if d.ambiguous_sets else d.named)
     likeliest = _probability(d, d.named[0]) if d.named else None
     if likeliest is not None:
-        text += f"; {key_name(d.named[0])} is the likelier with {percent(likeliest)}"
+        text += f"; {key_name(d.named[0])} is the likelier with {chance(likeliest)}"
     step = d.next_experiment
     if step is None:
         return [size(d), text, "no trial of the format is expected to tell them apart"]
@@ -332,7 +332,7 @@ def _pattern(d: Diagnosis) -> str:
 
 def unlisted(d: Diagnosis) -> str:
     """Sentence on the probability that a cause is at work which the catalogue lacks."""
-    return f"Something that the catalogue lacks is at work with a probability of {percent(d.unlisted)}."
+    return f"Something that the catalogue lacks is at work with a probability of {chance(d.unlisted)}."
 
 
 def proposal(d: Diagnosis) -> str | None:
@@ -408,7 +408,7 @@ def change(x: Change) -> str:
     """Sentence on a nominal parameter that has changed since an earlier fit."""
     return sentence(
         f"{x.name} was {measured(x.before, x.before_std, x.units)} and is {measured(x.after, x.after_std, x.units)}: "
-        f"{certainty(x.probability) if x.probability >= 0.5 else 'perhaps'} changed ({percent(x.probability)})"
+        f"{certainty(x.probability) if x.probability >= 0.5 else 'perhaps'} changed ({chance(x.probability)})"
     )
 
 

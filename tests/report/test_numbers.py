@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxfinger.report.numbers import extremes, measured, percent, percent_range, quantity, reach, with_error
+from jaxfinger.report.numbers import chance, extremes, measured, percent, percent_range, quantity, reach, with_error
 
 
 @pytest.mark.parametrize(
@@ -92,6 +92,11 @@ def test_extremes_share_the_digits_of_the_larger(high, low, text):
 )
 def test_shares(share, text):
     assert percent(share) == text
+
+
+@pytest.mark.parametrize(("probability", "text"), [(1.0, "over 99 %"), (0.9996, "over 99 %"), (0.41, "41 %")])
+def test_no_probability_is_certain(probability, text):
+    assert chance(probability) == text
 
 
 def test_an_interval_about_nothing_has_no_minus_zero():
