@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.smooth_laws import measured_columns, orthonormal_basis, white_features
@@ -24,15 +24,17 @@ class Column:
     column: int  # joint, tendon or axis
     rows: Int[np.ndarray, " n"]  # positions in the problem's stacked rows
     basis: Float[np.ndarray, "n K"]  # U_c, orthonormal
+    noise_known: bool = True  # from repeats or holds, not from residuals that may hold a law
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Dimensions of every column: K_c on the features, m_c = n_c − K_c outside of them; and which channel it is of."""
+    """Dimensions of every column: K_c on the features, m_c = n_c − K_c outside of them; its channel and its noise."""
 
     K: Int[np.ndarray, " C"]
     outside: Int[np.ndarray, " C"]
     channel: Int[np.ndarray, " C"]  # number of the experiment and quantity, from 0
+    noise_known: Bool[np.ndarray, " C"]  # as of `Column`
 
     def largest_of_channel(self, values: Float[np.ndarray, " C"]) -> Float[np.ndarray, " C"]:
         """For every column, the largest value in any column of its channel; values are zero or more."""
@@ -53,16 +55,18 @@ class Columns:
         items = []
         for e, c, k, pick in measured_columns(problem):
             features = np.concatenate(list(white_features(problem, e, c, k, pick).values()))
-            items.append(Column(e, c, k, problem.rows[e].start + pick, orthonormal_basis(features)))
+            known = problem.noise[e, c].source != "residuals"
+            items.append(Column(e, c, k, problem.rows[e].start + pick, orthonormal_basis(features), known))
         return cls(tuple(items))
 
     @cached_property
     def counts(self) -> Counts:
-        """Dimensions and channel of every column."""
+        """Dimensions, channel and noise of every column."""
         K = np.array([c.basis.shape[1] for c in self.items], int)
         channels = list(dict.fromkeys((c.experiment, c.channel) for c in self.items))
         channel = np.array([channels.index((c.experiment, c.channel)) for c in self.items], int)
-        return Counts(K, np.array([len(c.rows) for c in self.items], int) - K, channel)
+        known = np.array([c.noise_known for c in self.items], bool)
+        return Counts(K, np.array([len(c.rows) for c in self.items], int) - K, channel, known)
 
     def sums(self, values: Float[np.ndarray, "features *n"]) -> Float[np.ndarray, "C *n"]:
         """Sum a value of every feature over each column's features."""

@@ -23,9 +23,10 @@ inexact form of its law may leave, and K_u that of what unknown causes leave. Fr
 3. Lower bounds of v_c. Noise alone leaves up to φ_c = φ max(1, (ν + o_c) / (ν + m_c)): its colour is known from a few
    repeats, and its size is at least the one seen outside of the features. Inexact laws leave up to ρ² E_c / K_c.
 
-4. Outside of the features. Less energy there than noise leaves on average, m_c, counts as in noise of known size. The
-   excess o_c − m_c counts as if it came from ν independent samples, as in Student's distribution: the size of the noise
-   is known to one part in √ν, and misfits there come in bursts. Together
+4. Outside of the features. Less energy there than noise leaves on average, m_c, counts as in noise of known size, where
+   repeats or holds tell the noise; where residuals do, which may hold a law, it does not count. The excess o_c − m_c
+   counts as if it came from ν independent samples, as in Student's distribution: the size of the noise is known to one
+   part in √ν, and misfits there come in bursts. Together
 
        log L = −½ Σ_c [ K_c log v_c + e_c / v_c + min(o_c − m_c, 0) + ν log(1 + max(o_c − m_c, 0) / ν) ],         (L)
        v_c   = max(e_c / K_c, φ_c, ρ² E_c / K_c).
@@ -111,7 +112,8 @@ def log_likelihood(
     v = np.maximum(e / K, _variance_floor(counts, o, explained, p))
     beyond = o - counts.outside
     excess = np.maximum(beyond, 0.0) / nu
-    value = -0.5 * (K * np.log(v) + e / v + np.minimum(beyond, 0.0) + nu * np.log1p(excess))
+    less = np.where(counts.noise_known, np.minimum(beyond, 0.0), 0.0)
+    value = -0.5 * (K * np.log(v) + e / v + less + nu * np.log1p(excess))
     return value, Weights(1.0 / v, 1.0 / (1.0 + excess))
 
 

@@ -42,7 +42,7 @@ def test_probabilities_are_shares_of_evidence_beyond_what_each_set_costs():
 
 
 BOTH, WITHOUT_STRETCH, WITHOUT_STRIBECK = (frozenset(s) for s in ({STRETCH, STRIBECK}, {STRIBECK}, {STRETCH}))
-COUNTS = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1]))
+COUNTS = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1]), np.ones(2, bool))
 
 
 def genuine(left: dict[frozenset, tuple[float, float]], gain: float = 50.0, counts: Counts = COUNTS) -> dict:
@@ -98,7 +98,11 @@ def test_what_one_effect_imitates_another_seldom_imitates_too():
 
 def test_the_log_score_of_a_record_is_that_of_its_probabilities():
     """A cause that is worth its cost is as likely as not; the others and «unlisted» are unlikely, and rightly so."""
-    counts, none, p = Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1])), np.zeros(2), Parameters()
+    counts, none, p = (
+        Counts(np.array([10, 10]), np.array([100, 100]), np.array([0, 1]), np.ones(2, bool)),
+        np.zeros(2),
+        Parameters(),
+    )
     noise, outside = p.variance_floor * counts.K, np.full(2, 100.0)
     evidence = {frozenset(): Evidence(noise + 5000.0 * EXCURSION, outside, none, 0.0)}
     record = Record("case", counts, evidence, frozenset(), EXPLAINABLE, frozenset({STRETCH}), p)

@@ -1,5 +1,7 @@
 """The formula on made-up rows: random features, signatures and noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,15 @@ def test_a_cause_that_acts_outside_of_the_features_counts_where_noise_is_less_th
     model = linear(columns, r, 12.0 * z[None])
     gain, occam = model.fit(np.array([0])).score - model.null.score, np.log(12.0) + 0.5
     assert gain == pytest.approx(0.5 * (z @ r) ** 2 - occam, rel=0.02)
+
+
+def test_less_than_a_noise_that_only_residuals_tell_is_no_evidence(columns, rng):
+    """Such noise may be a law that the model lacks, and what imitates a part of it is no cause."""
+    z = quick(columns, rng, 0)
+    r = 0.6 * rng.standard_normal(ROWS * COLUMNS) + 12.0 * z
+    unknown = Columns(tuple(replace(c, noise_known=False) for c in columns.items))
+    model = linear(unknown, r, 12.0 * z[None])
+    assert model.fit(np.array([0])).score < model.null.score
 
 
 def test_an_amplitude_keeps_to_its_bounds(columns, rng):
