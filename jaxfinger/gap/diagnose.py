@@ -123,7 +123,9 @@ def diagnose(
     problem = build(session, recipe, progress, told, COARSE if quick else 1, against)
     sentences = [x.sentence for x in doubts]
     if against is not None and against.was_made_from(session):
-        sentences.append("the earlier fit was made from this session, whose data then count twice")
+        sentences.append(
+            "the earlier fit was made from this session, whose data then count twice; give a fit of an earlier session"
+        )
     diagnosis = partial(
         Diagnosis,
         data=Path(session.file).name if session.file else "",
@@ -229,8 +231,8 @@ def _refuse_odd_tolerance(tolerance: Mapping[str, float]) -> None:
         if channel not in channels:
             near, known = did_you_mean(channel, channels), ", ".join(channels)
             raise UserError(f"tolerance of {channel}{near}: is of no channel that is judged; these are {known}")
-        said = f"{share:g}" if isinstance(share, Real) else repr(share)
         if not isinstance(share, Real) or not 0.0 <= share < 1.0:
+            said = f"{share:g}" if isinstance(share, Real) else repr(share)
             raise UserError(f"tolerance of {channel}: is {said}; say a share of its signal, such as 0.02")
 
 

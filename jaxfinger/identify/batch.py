@@ -216,6 +216,7 @@ def _stack_sessions(
 def _described(
     sessions: Sequence[Session], template: Fit, compressed: Compressed, plan: Plan, parameters: list[Parameter]
 ) -> _Described:
+    """What the sessions' descriptions say, one row a session."""
     basis, k = compressed.basis, compressed.sizes[0]
     at = basis[:, :k].argmax(axis=0)  # positions of the values that are given, of which each column holds one
     priors, scales = [], []

@@ -28,13 +28,14 @@ _MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
 _MIN_ARM_RATIO, _MAX_ARM_RATIO = 0.2, 1.5
-# Ratio of the arm that excursions show to the largest that the torques of a tendon allow that was let go, too: half-way
-# between 1 and the 2 of a diameter for a radius, or of a load cell at a pulley, as ratios count.
+# Largest ratio of the arm that excursions show to the largest one that torques allow (`_most_felt`). It lies half-way,
+# as ratios count, between 1 and 2, which a diameter for a radius gives, or a load cell at a pulley.
 _MAX_SCALE = np.sqrt(2.0)
-# Shares of the highest tension: below the first a tendon is slack before it is pulled. Let go to the last, it has slid
-# back, if it loses two thirds of its tension at most: (1 − 2/3) / (1 + 2/3).
+# Shares of the highest tension. Below the first a tendon is slack before it is pulled. Once it is let go to the last,
+# it has slid back, if it loses two thirds of its tension at most: (1 − 2/3) / (1 + 2/3).
+# Below the second, noise is large.
 _SLACK_SHARE, _LEAST_SHARE, _SLID_SHARE = 0.05, 0.1, 0.2
-_MIN_LET_GO = 5  # samples of a thinned trial, to tell an arm
+_MIN_LET_GO = 5  # samples of a thinned trial while the tendon is slack, and while it slides back
 _FORCE_RATIOS = (0.002, 1.0)  # N at the fingertip for each N of tension: a moment arm over a finger's length, with room
 # Moment arms as shares of the finger's length: neither nearly as long as a finger nor thinner than a hair.
 _MIN_ARM, _MAX_ARM = 0.004, 0.4
@@ -110,8 +111,8 @@ def _most_felt(tension: np.ndarray, torque: np.ndarray) -> float:
     """Largest moment arm, m, that the torques (N,) at a held joint allow, by a tendon's tensions (N,) in N.
 
     While the tension rises, friction lets no more than the tension come to the joint; once the tendon slides back, no
-    less. So the torque changes by the arm or more for each N between slack and sliding back. Infinite where the tendon
-    was not slack before the pull, or was not let go.
+    less. So for each N between slack and sliding back the torque changes by the arm or more. The result is infinite
+    where the tendon was not slack before the pull, or was not let go.
     """
     f, y = thinned(tension), thinned(torque)
     good = np.isfinite(f) & np.isfinite(y)

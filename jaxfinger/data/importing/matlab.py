@@ -55,8 +55,8 @@ def load_mat(path: Path) -> Recording:
         if isinstance(value, _Unusable):
             unusable[name] = str(value)
             continue
-        outer, signals, _ = re.split(r"(\.signals(?:\(\d+\))?\.)|$", name, maxsplit=1)
-        clock = f"{outer}.time" if signals else ""
+        signals = re.search(r"\.signals(\(\d+\))?\.", name)
+        clock = f"{name[: signals.start()]}.time" if signals else ""
         variables[name] = Variable(_samples_first(value), clock=clock)
     on_clocks = {name: _on_clock(v, variables) for name, v in variables.items()}
     return Recording(path, samples_first(on_clocks), unusable)

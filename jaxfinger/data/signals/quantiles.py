@@ -46,8 +46,8 @@ def quantiles(columns: Float[np.ndarray, "N k"], share: float) -> Float[np.ndarr
 def _near(values: Float[np.ndarray, " N"], k: int) -> tuple[Float[np.ndarray, " n"], int]:
     """Some values among which are the k-th smallest, the next larger one and every NaN, and the rank of the k-th there.
 
-    The bracket reaches four standard deviations of the sample's rank to either side. Values that it misses, as a drift
-    in step with the sample may, are all kept.
+    The bracket reaches four standard deviations of the sample's rank to either side. Where it misses the k-th, as it
+    may where values repeat in step with the sample, all values are returned.
     """
     if len(values) < MIN_LENGTH:
         return values, k
