@@ -104,7 +104,7 @@ class Place:
     def fail(self, message: str) -> NoReturn:
         """Raise UserError with a message about this key."""
         where = self.file if self.line is None else f"{self.file}, line {self.line}"
-        raise UserError(f"{where}: {self.key + ': ' if self.keys else ''}{message}")
+        raise UserError(f"{where}: {self.key + ': ' if self.keys else ''}{message}") from None
 
 
 @dataclass(frozen=True)

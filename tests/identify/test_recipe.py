@@ -60,8 +60,9 @@ def test_a_recipe_that_was_made_in_python_has_the_checks_of_a_file():
         for run in (identify, diagnose):
             with pytest.raises(UserError, match=re.escape(f"recipe 'mine': {says}")):
                 run(session, odd)
-        with pytest.raises(UserError, match=re.escape(f"the recipe: {says}")):
+        with pytest.raises(UserError, match=re.escape(f"the recipe: {says}")) as raised:
             read_recipe({part: value})
+        assert raised.value.__suppress_context__  # The sentence stands alone in a notebook.
 
 
 def test_a_name_that_is_nearly_a_shipped_one():
