@@ -17,10 +17,8 @@ from jaxfinger.errors import UserError
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT
 from jaxfinger.identify.linearise import white_rows
-from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.resample import compress, plan_of
-from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.parameters import Free, ravel
+from jaxfinger.identify.resample import compress, read_again
 from jaxfinger.identify.uncertainty import Samples
 
 
@@ -55,13 +53,9 @@ def sampled_posterior(
     if JOINT not in {s.name for s in fit.stages}:
         raise UserError("a staged fit is not the optimum of one posterior; refine it first")
     compressed = compress(session, fit)
-    ((reads, _),) = plan_of(session, fit)
-    stacks = readings_of(session, [t.name for t in session if t.experiment in reads], model=fit.model)
-    reads = {e: c for e, c in reads.items() if e in stacks}
     basis, start, prior = jnp.asarray(compressed.basis), ravel(fit.model), compressed.grams.H[-1]
     sources = [
-        (s.batch, s.filters, Free.at(fit.model, s.positions), s.positions)
-        for s in sources_of(stacks, reads, fit.noise, describe(fit.model)).values()
+        (s.batch, s.filters, Free.at(fit.model, s.positions), s.positions) for s in read_again(session, fit)[2].values()
     ]
 
     def log_density(z):

@@ -22,13 +22,14 @@ from jaxtyping import Array, Bool, Float
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
+from jaxfinger.experiments import Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import visible
+from jaxfinger.identify.solve import Source, visible
 from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free
 from jaxfinger.identify.trial_coverage import coverage_of
 
@@ -64,12 +65,7 @@ class Compressed:
 def compress(session: Session, fit: Fit) -> Compressed:
     """Linearise and compress the trials of `session`, from which the fit was made; no later step reads samples."""
     parameters = describe(fit.model)
-    plan = plan_of(session, fit)
-    names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
-    stacks = readings_of(session, names, model=fit.model)
-    plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
-    everything = {e: c for reads, _ in plan for e, c in reads.items()}
-    sources = sources_of(stacks, everything, fit.noise, parameters)
+    plan, stacks, sources = read_again(session, fit)
     P = len(parameters)
     blocks, trials = [], []
     for e, source in sources.items():
@@ -105,6 +101,23 @@ def compress(session: Session, fit: Fit) -> Compressed:
         tuple(t for _, t in trials),
         tuple((e, session[t].joint, session[t].tendon) for e, t in trials),
     )
+
+
+def read_again(session: Session, fit: Fit) -> tuple[Plan, dict[str, Stack], dict[str, Source]]:
+    """Read the trials of a fit anew.
+
+    Returns:
+        The plan, without experiments of which the session has no trial, and the stacks and sources of the others.
+
+    Raises:
+        UserError: as `plan_of`.
+    """
+    plan = plan_of(session, fit)
+    names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
+    stacks = readings_of(session, names, model=fit.model)
+    plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
+    everything = {e: c for reads, _ in plan for e, c in reads.items()}
+    return plan, stacks, sources_of(stacks, everything, fit.noise, describe(fit.model))
 
 
 def plan_of(session: Session, fit: Fit) -> Plan:

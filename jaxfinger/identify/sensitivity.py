@@ -15,7 +15,7 @@ trial k:
     Δθ_s = (∂S_s/∂θ_s − H_k)⁻¹ (S_s,k − Σ_t<s (∂S_s/∂θ_t − H_k,st) Δθ_t).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,13 +32,12 @@ from jaxfinger.experiments import Batch, Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import scaled_directions
 from jaxfinger.identify.linearise import Filters, huber, white_rows
-from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
+from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.readings import readings_of
-from jaxfinger.identify.resample import plan_of
+from jaxfinger.identify.resample import read_again
 from jaxfinger.identify.solve import Source
-from jaxfinger.identify.stages import cad_covariance, cad_prior, sources_of
+from jaxfinger.identify.stages import cad_covariance, cad_prior
 from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"
@@ -99,18 +98,14 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
     require(Session, session=session)
     kinds = chosen(to, KINDS, "kind of data")
     model_for(fit, session)  # raises for a session of another finger
-    parameters, plan = describe(fit.model), plan_of(session, fit)
-    names = [t.name for t in session if any(t.experiment in reads for reads, _ in plan)]
-    stacks = readings_of(session, names, model=fit.model)
-    plan = [({e: c for e, c in reads.items() if e in stacks}, free) for reads, free in plan]
-    reads = {e: c for r, _ in plan for e, c in r.items()}
-    if not reads:
+    parameters, (plan, stacks, sources) = describe(fit.model), read_again(session, fit)
+    if not sources:
         raise UserError(f"{session.file or 'the session'}: has none of the trials that the fit was made from")
-    sources = sources_of(stacks, reads, fit.noise, parameters)
-    sensors = _sensors(session, stacks, reads) if SENSORS in kinds else {}
+    sensors = _sensors(session, stacks, sources) if SENSORS in kinds else {}
     scores = {e: _gradient_of(fit, s, [at(e) for at in sensors.values()]) for e, s in sources.items()}
-    given = np.setdiff1d(np.flatnonzero(np.diag(cad_covariance(session, parameters)) > 0), _estimated(plan))
-    cad = np.union1d(given, _with_prior(plan, session, parameters)).astype(int)
+    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
+    cad = np.flatnonzero(std > 0)
+    given = np.setdiff1d(cad, np.concatenate([free for _, free in plan]))  # what no stage estimates
 
     data = _Data(tuple((e, t) for e in sources for t in stacks[e].trials), tuple(sensors), cad)
     P, K = len(parameters), len(data.trials)
@@ -134,7 +129,6 @@ def sensitivity(fit: Fit, session: Session, to: str | Sequence[str] = KINDS) -> 
             kept = np.flatnonzero(~alone[free, j])
             without[free[kept], j] = _step_without(H - mine, by[:, j], free, kept, without[:, j])
     names = {TRIALS: [t for _, t in data.trials], SENSORS: list(sensors), CAD: [parameters[i].name for i in cad]}
-    std = np.sqrt(np.diag(cad_covariance(session, parameters)))
     values = {k: derivatives[:, data.columns(k)].T for k in KINDS}
     moves = {TRIALS: np.where(alone, np.inf, without).T, SENSORS: 0.01 * values[SENSORS]}
     moves[CAD] = std[cad][:, None] * values[CAD]
@@ -251,17 +245,13 @@ def _require_optimum(step: Float[np.ndarray, " k"], session: Session) -> None:
         )
 
 
-def _estimated(plan) -> np.ndarray:
-    return np.unique(np.concatenate([np.zeros(0, int), *(free for _, free in plan)]))
+def _sensors(
+    session: Session, stacks: dict[str, Stack], experiments: Iterable[str]
+) -> dict[str, Callable[[str], Batch]]:
+    """Sensors that matter in one of the experiments, by name.
 
-
-def _with_prior(plan, session: Session, parameters: list[Parameter]) -> np.ndarray:
-    cad = np.diag(cad_covariance(session, parameters)) > 0
-    return np.array([i for i in _estimated(plan) if cad[i]], dtype=int)
-
-
-def _sensors(session: Session, stacks: dict[str, Stack], reads) -> dict[str, Callable[[str], Batch]]:
-    """Sensors by name, each with a function that gives the derivative of an experiment's batch by its gain."""
+    Each comes with a function that gives the derivative of an experiment's batch by the sensor's gain.
+    """
     finger, out = session.finger, {}
     for i, joint in enumerate(finger.joint_names):
         out[f"torque {joint}"] = lambda e, i=i: _gain(stacks[e].batch, "joint_torque", i)
@@ -269,7 +259,7 @@ def _sensors(session: Session, stacks: dict[str, Stack], reads) -> dict[str, Cal
         if finger.active[k]:
             out[f"tension {tendon}"] = lambda e, k=k: _gain(stacks[e].batch, "tension", k)
             out[f"excursion {tendon}"] = lambda e, k=k: _gain(stacks[e].batch, "tendon_excursion", k)
-    return {name: at for name, at in out.items() if any(_moves(at(e)) for e in reads)}
+    return {name: at for name, at in out.items() if any(_moves(at(e)) for e in experiments)}
 
 
 def _gain(batch: Batch, what: str, column: int) -> Batch:
