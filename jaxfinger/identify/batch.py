@@ -23,7 +23,7 @@ from jaxfinger.errors import UserError, require
 from jaxfinger.experiments import Batch
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
-from jaxfinger.identify.linearise import Filters, huber, white_rows
+from jaxfinger.identify.linearise import Filters, robust_residuals, white_rows
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel, with_flat
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import (
@@ -80,7 +80,7 @@ class _Source(eqx.Module):
     def rows(self, model: Model, flat: Float[Array, " P"], limit: float | Float[Array, ""]) -> Float[Array, " r"]:
         """White residuals under Huber's cost."""
         at = self.free.set(model, flat[self.columns])
-        return huber(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)
+        return robust_residuals(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)
 
 
 class _Stage(eqx.Module):
@@ -300,7 +300,7 @@ def _fit_stage(model: Model, flat: Float[Array, " P"], sources: list[_Source], s
 
     def rows(y, _):
         moved = [r + J @ (y - start) for r, J in along]
-        return huber(jnp.concatenate([*moved, *white(y, curved)]), limit), stage.root @ (y - stage.mean)
+        return robust_residuals(jnp.concatenate([*moved, *white(y, curved)]), limit), stage.root @ (y - stage.mean)
 
     linear_beyond = jnp.where(limit > 0.0, limit, jnp.inf), jnp.inf
     options = {"lower": stage.low, "upper": stage.high, "linear_beyond": linear_beyond}

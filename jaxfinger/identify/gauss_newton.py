@@ -102,8 +102,8 @@ class VisibleGaussNewton(optx.AbstractLeastSquaresSolver):
     rejected, or where rounding hides the change of the cost and steps become no shorter.
 
     Options: `lower` and `upper`, shaped like y. An entry that starts outside of its bounds moves only towards them.
-    `linear_beyond`, a number for each leaf of the residual: beyond it a row is a square root of Huber's cost (`huber`).
-    Jacobians are always computed forwards.
+    `linear_beyond`, a number for each leaf of the residual: beyond it a row is a square root of Huber's cost
+    (`linearise`). Jacobians are always computed forwards.
     """
 
     rtol: float = 0.0

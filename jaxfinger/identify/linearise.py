@@ -166,26 +166,20 @@ def _flat(white: dict):
     return wide.reshape(*wide.shape[:-2], -1)
 
 
-def huber(r: Float[Array, "*N"], limit: float | Float[Array, ""]) -> Float[Array, "*N"]:
+def robust_residuals(
+    r: Float[Array | np.ndarray, "*N"], limit: float | Float[Array, ""]
+) -> Float[Array | np.ndarray, "*N"]:
     """s(r) of the module's docstring, whose squares are Huber's cost; a `limit` of 0 leaves r as it is."""
-    a = jnp.abs(r)
+    xp, a = r.__array_namespace__(), abs(r)
     beyond = (limit > 0.0) & (a > limit)
-    root = jnp.sqrt(jnp.where(beyond, limit * (2.0 * a - limit), 1.0))
-    return jnp.where(beyond, jnp.sign(r) * root, r)
+    root = xp.sqrt(xp.where(beyond, limit * (2.0 * a - limit), 1.0))
+    return xp.where(beyond, xp.sign(r) * root, r)
 
 
 def robust_share(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, "*N"]:
     """∂s/∂r: factor of the Jacobian's rows under Huber's cost, computed by NumPy; 1 where `limit` is 0."""
     a = np.maximum(np.abs(r), limit)
     return limit / np.sqrt(limit * (2.0 * a - limit)) if limit else np.ones_like(a)
-
-
-def robust_residuals(r: Float[np.ndarray, "*N"], limit: float) -> Float[np.ndarray, "*N"]:
-    """s(r) of the module's docstring, computed by NumPy; `r` itself where `limit` is 0."""
-    if not limit:
-        return r
-    beyond = np.sign(r) * np.sqrt(np.maximum(limit * (2.0 * np.abs(r) - limit), 0.0))
-    return np.where(np.abs(r) > limit, beyond, r)
 
 
 def residuals_of(model: Model, batch: Batch, channels: tuple[str, ...]) -> dict[str, Float[np.ndarray, "_columns B T"]]:

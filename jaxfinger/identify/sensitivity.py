@@ -31,7 +31,7 @@ from jaxfinger.errors import UserError, chosen, require
 from jaxfinger.experiments import Batch, Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import scaled_directions
-from jaxfinger.identify.linearise import Filters, huber, white_rows
+from jaxfinger.identify.linearise import Filters, robust_residuals, white_rows
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
@@ -302,7 +302,7 @@ def _gradient(model: Model, free: Free, batch: Batch, filters: Filters, limit, c
         return jnp.where(limit > 0.0, jnp.clip(r, -limit, limit), r)
 
     def cost(theta, data: Batch, weights):
-        return 0.5 * jnp.sum(weights[:, None] * huber(rows(theta, data), limit) ** 2)
+        return 0.5 * jnp.sum(weights[:, None] * robust_residuals(rows(theta, data), limit) ** 2)
 
     whole, gradient = jnp.ones(B), jax.grad(cost)
     # The gradient's derivative by the weight of a trial is that trial's own gradient.

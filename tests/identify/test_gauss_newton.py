@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 from jaxfinger.identify.gauss_newton import COST_ROUNDING, Outcome, VisibleGaussNewton
-from jaxfinger.identify.linearise import huber
+from jaxfinger.identify.linearise import robust_residuals
 
 SOLVER = VisibleGaussNewton(atol=1e-9)
 
@@ -94,7 +94,7 @@ def test_a_robust_fit_takes_few_steps_however_many_rows_are_outliers(outliers):
     prior = jnp.full(2, 9.0)  # beyond the limit, and no row of Huber's cost
 
     def rows(theta, _):
-        return huber(jnp.asarray(y - A @ theta), limit), prior * (1.0 + 1e-3 * theta[:2])
+        return robust_residuals(jnp.asarray(y - A @ theta), limit), prior * (1.0 + 1e-3 * theta[:2])
 
     @jax.jit
     def solved(start):

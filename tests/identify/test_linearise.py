@@ -12,10 +12,10 @@ from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import SAMPLES, TRIALS, blocks, in_rows, padded_size, predict, prepare, shapes
 from jaxfinger.identify.linearise import (
     _tangent,
-    huber,
     linearise,
     residuals_by_tangent,
     residuals_of,
+    robust_residuals,
     tangent,
     white_rows,
 )
@@ -87,7 +87,7 @@ def test_the_common_shape_changes_no_derivative(stack, short_truth, effects):
     found = linearise(model, free, stack.batch, source.filters, limit)
     np.testing.assert_allclose(found.white, r, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.jacobian, J, rtol=1e-7, atol=1e-7 * np.abs(J).max())
-    s, J_s = jax.jvp(lambda r: huber(r, limit), (jnp.asarray(r),), (jnp.ones_like(r),))
+    s, J_s = jax.jvp(lambda r: robust_residuals(r, limit), (jnp.asarray(r),), (jnp.ones_like(r),))
     assert np.any(np.asarray(J_s) < 1.0)
     whole = np.concatenate([J * np.asarray(J_s)[..., None], np.asarray(s)[..., None]], axis=-1)
     expected = np.einsum("brp,brq->bpq", whole, whole)
