@@ -250,6 +250,9 @@ class Flag(IntFlag):
         }[self]
 
 
+FLAGGED = int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)  # bits of a sample's flags, one of which marks it unsound
+
+
 def layout(ring: int = RING) -> dict[str, tuple[int, int]]:
     """Offset and size in bytes of every symbol in the stand-in's memory: end to end, on 8-byte boundaries."""
     place, offset = {}, 0

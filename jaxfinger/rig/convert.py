@@ -18,7 +18,7 @@ from jaxfinger.errors import UserError, counted
 from jaxfinger.rig import wal
 from jaxfinger.rig.backend import Block
 from jaxfinger.rig.channels import SAFETY_KINDS, SI_UNITS, Filter, RigDescription
-from jaxfinger.rig.contract import Flag
+from jaxfinger.rig.contract import FLAGGED
 
 
 @dataclass
@@ -215,7 +215,7 @@ def _samples(logged: LoggedTrial, width: int, rate_hz: float) -> Samples:
     fresh = seq > np.maximum.accumulate(np.concatenate([[-1], seq[:-1]])) if len(seq) else np.empty(0, bool)
     keep = fresh & (seq >= int(logged.start["seq"]))
     seq, t, x = seq[keep], t[keep], x[keep]
-    sound = np.isfinite(x).all(1) & ((flags[keep] & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) == 0)
+    sound = np.isfinite(x).all(1) & ((flags[keep] & FLAGGED) == 0)
     if not len(seq):
         return Samples(seq, seq * 1.0, x, keep[:0], [], 0)
     steps, jump = np.diff(t), np.diff(seq)

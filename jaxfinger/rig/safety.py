@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxfinger.rig.backend import Block, Command, CommandRefused, JointMove, TensionRamp
 from jaxfinger.rig.channels import SI_UNITS, RigDescription, for_people
-from jaxfinger.rig.contract import DRIVES_ON, Flag, State, Trip
+from jaxfinger.rig.contract import DRIVES_ON, FLAGGED, Flag, State, Trip
 from jaxfinger.rig.trips import Drift, LeakyCount, RunLength, StillExcursion, UnexplainedExcursion, UnfollowedMove
 
 # Samples over which the host takes joint velocity and tension rate: 20 ms at 1 kHz. One step of a 14-bit encoder
@@ -208,7 +208,7 @@ class Supervisor:
             value = float(block.x[row, channel])
             trip = self._trip[channel] if np.isfinite(value) else Trip.INVALID
             found.append(self._violation(trip, channel, int(seq[row]), value, since))
-        flagged = (block.flags & int(Flag.BUS | Flag.ENCODER | Flag.ANALOG)) != 0
+        flagged = (block.flags & FLAGGED) != 0
         for _, row, since in self._flag_count(flagged[:, None], seq):
             flags = [flag.says for flag in Flag if block.flags[row] & int(flag)]
             cause = Trip.INVALID.said(f"{' and '.join(flags)} at sample {int(seq[row])}")
@@ -251,9 +251,9 @@ class Supervisor:
     def _tracking(self, block: Block, seq: np.ndarray) -> list[Violation]:
         """TRACKING where a tension differs from its set-point by more than tension_error_max for tension_error_s.
 
-        Samples count only in the states ARMED and MOVING: otherwise the tension follows no set-point.
+        Samples count only where the drives are on: otherwise the tension follows no set-point.
         """
-        on = (block.state == State.ARMED) | (block.state == State.MOVING)
+        on = np.isin(block.state, DRIVES_ON)
         error = block.x[:, self._setpoint] - block.x[:, self._follower]
         off_target = on[:, None] & (np.abs(error) > self.rig.limits.tension_error_max)
         found = []

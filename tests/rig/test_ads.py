@@ -28,7 +28,7 @@ from jaxfinger.rig.backend import (
     TensionRamp,
 )
 from jaxfinger.rig.backends import ads
-from jaxfinger.rig.contract import Kind, State, Trip
+from jaxfinger.rig.contract import DRIVES_ON, Kind, State, Trip
 from jaxfinger.rig.simulated import standin
 from jaxfinger.rig.simulated.ams import AmsServer
 from jaxfinger.rig.waits import reached
@@ -53,7 +53,7 @@ def mend(where):
         rig.prepare(Setup("", fixed=dict.fromkeys(rig.description.finger.joint_names, 0.0)))
         rig.read_block(20.0)
         while (state := rig.status().state) is not State.IDLE:
-            if state in (State.ARMED, State.MOVING):
+            if state in DRIVES_ON:
                 rig.release()
             with contextlib.suppress(CommandRefused):
                 rig.reset("tester")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxfinger.rig import contract
-from jaxfinger.rig.contract import Flag, Kind, Mode, Refusal, State, Trip
+from jaxfinger.rig.contract import DRIVES_ON, Flag, Kind, Mode, Refusal, State, Trip
 from jaxfinger.rig.simulated.faults import CATALOGUE
 from jaxfinger.rig.simulated.plant import DT, Plant, Sensors
 
@@ -198,7 +198,7 @@ class Controller:
         """Have the external motor hold the joint to which it is coupled, once the drives are on."""
         if Mode.MOTOR not in self.plant.mode:
             self.motor = None
-        elif self.motor is None and self.state in (State.ARMED, State.MOVING):
+        elif self.motor is None and self.state in DRIVES_ON:
             self.goal = self.plant.q[self.plant.mode.index(Mode.MOTOR)]
             self.motor = (self.goal, 0.0, 0.0)
 
@@ -214,7 +214,7 @@ class Controller:
 
     def _obey(self, kind: int, index: int, rate: float, acceleration: float, target: list[float]) -> Refusal:
         """Carry out a command, or refuse it. STOP is obeyed in every state."""
-        on = self.state in (State.ARMED, State.MOVING)
+        on = self.state in DRIVES_ON
         if kind == Kind.STOP:
             self._stop(Trip(index), -1, 0.0)
         elif kind == Kind.RESET:
@@ -272,7 +272,7 @@ class Controller:
         (beat,) = struct.unpack_from("<Q", self.memory, offset)
         self.beat_age = 0 if beat != self.beat else self.beat_age + 1
         self.beat = beat
-        if self.state in (State.ARMED, State.MOVING) and self.beat_age * DT > self.limits.heartbeat_s:
+        if self.state in DRIVES_ON and self.beat_age * DT > self.limits.heartbeat_s:
             self._stop(Trip.HEARTBEAT, -1, self.beat_age * DT)
 
     def _brake(self) -> None:
@@ -300,7 +300,7 @@ class Controller:
         if self.state is State.TRIPPED:
             return
         self.trip, self.trip_seq, self.trip_slot, self.trip_value = trip, self.seq, slot, value
-        if self.state in (State.ARMED, State.MOVING):
+        if self.state in DRIVES_ON:
             self._release()
         if trip in (Trip.TENSION, Trip.SLACK):  # Over-tension or a broken tendon: their drives go off without a ramp.
             self._from = self.setpoint = [0.0] * self.plant.n
@@ -392,7 +392,7 @@ class Controller:
         """Stop where a hard limit's leaky count is full. One odd sample must not drop the finger; a value that is bad
         every other time must.
         """
-        if self.state not in (State.ARMED, State.MOVING):
+        if self.state not in DRIVES_ON:
             self.over.clear()
             return
         limits, slots, values = self.limits, self.slots, self._values
