@@ -40,6 +40,15 @@ class Cell(NamedTuple):
     rows: int  # how many
 
 
+class Shares(NamedTuple):
+    """Mean shares over the channels with a gap, of each the mean over its columns with a gap, and 95 % intervals."""
+
+    of_causes: Float[np.ndarray, " causes"]  # what comes back without each cause
+    of_causes_ci95: Float[np.ndarray, "causes 2"]
+    left: float  # with all causes
+    left_ci95: tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Budget:
     """Sums of squares of held-out white residuals in each cell."""
@@ -78,16 +87,15 @@ class Budget:
         return np.clip(np.column_stack([lost, left]) / gap[:, None], 0.0, 1.0)
 
     @cached_property
-    def overall(self) -> tuple[np.ndarray, np.ndarray, float, tuple[float, float]]:
-        """Mean shares over the channels with a gap, of each the mean over its columns with a gap.
+    def overall(self) -> Shares:
+        """Shares of the whole gap.
 
-        Their 95 % intervals, from a bootstrap over trials, say how the mean depends on the trials that were recorded,
-        and not how channels differ. Returns the share of each cause (causes,), its interval (causes, 2), the share left
-        with all causes, and its interval.
+        Their intervals, from a bootstrap over trials, say how the mean depends on the trials that were recorded, and
+        not how channels differ.
         """
         if not self.open:
             none = np.zeros(len(self.without))
-            return none, np.zeros((len(none), 2)), 0.0, (0.0, 0.0)
+            return Shares(none, np.zeros((len(none), 2)), 0.0, (0.0, 0.0))
         rng = np.random.default_rng(0)
         unit, strata = self._drawn()
         inside = [
@@ -106,7 +114,8 @@ class Budget:
                 draws.append(means(weights))
         low, high = np.quantile([value, *draws], (0.025, 0.975), axis=0)
         low, high = np.minimum(low, value), np.maximum(high, value)
-        return value[:-1], np.stack([low[:-1], high[:-1]], axis=1), float(value[-1]), (float(low[-1]), float(high[-1]))
+        left_ci95 = float(low[-1]), float(high[-1])
+        return Shares(value[:-1], np.stack([low[:-1], high[:-1]], axis=1), float(value[-1]), left_ci95)
 
     def _drawn(self) -> tuple[Int[np.ndarray, " cells"], list[np.ndarray]]:
         """What the bootstrap draws: the unit to which each cell belongs, and strata of units.

@@ -1,6 +1,6 @@
 """Parts of a diagnosis beside its verdict, from the results of the search, of the fits and on held-out trials."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -61,16 +61,15 @@ def columns_with_gap(counts: Counts, null: Evidence, chosen: Evidence, p: Parame
     return frozenset(np.flatnonzero(found > MIN_GAP_EVIDENCE).tolist())
 
 
-def by_share(named, chosen: SearchState, shares: Budget) -> list:
+def by_share(named: Iterable[CauseKey], chosen: SearchState, shares: Budget) -> list[CauseKey]:
     """Named causes, largest share of the gap first."""
-    value, _, _, _ = shares.overall
-    order = dict(zip(chosen.keys, value, strict=True))
+    order = dict(zip(chosen.keys, shares.overall.of_causes, strict=True))
     return sorted(named, key=lambda k: -order.get(k, 0.0))
 
 
 def causes_of(chosen: SearchState, found: Posterior, shares: Budget, fit: Fit) -> tuple[Cause, ...]:
     """One line for each effect of the chosen set, its sites together, largest share first."""
-    value, ends, _, _ = shares.overall
+    value, ends = shares.overall.of_causes, shares.overall.of_causes_ci95
     by_channel: dict[tuple[str, str], set[int]] = {}
     for c in sorted(shares.open):
         by_channel.setdefault(shares.channels[c], set()).add(c)
@@ -100,7 +99,7 @@ def unexplained_part(
     chosen: SearchState, shares: Budget, left: list[SmoothPart], status: Status, progress: Progress
 ) -> Unexplained:
     """Share of the gap that the chosen set leaves, the variables that it depends on, and a closed form for it."""
-    _, _, share, ends = shares.overall
+    share, ends = shares.overall.left, shares.overall.left_ci95
     if status is Status.NO_GAP or not left or left[0].energy <= 0:
         return Unexplained(share, ends, (), None, None)
     worst = left[0]
@@ -213,7 +212,7 @@ def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: 
     """
     order = sorted(found.causes, key=lambda k: (-found.causes[k], -found.gains[k]))
     inside = {k: values_of(fit, i) for i, k in enumerate(chosen.keys)}
-    gain = dict(zip(chosen.keys, shares.overall[0].tolist(), strict=True))
+    gain = dict(zip(chosen.keys, shares.overall.of_causes.tolist(), strict=True))
     others = search.alone(k for k in order if k not in inside)
     likely = [k for k in order if k in others][:MAX_HELD_OUT]
     signatures = [search.table.signatures.dense(others[k].offer.rows, problem.r.size) for k in likely]

@@ -70,7 +70,7 @@ def test_a_channel_of_one_trial_has_an_interval_from_the_parts_of_that_trial():
     cells = [Cell(0, 0, fold, 50) for fold in range(FOLDS)]
     before, after = np.full(FOLDS, 200.0), np.array([50.0, 60.0, 90.0])
     budget = Budget(cells, before, after, before[None], frozenset({0}), CHANNELS)
-    (share,), ((low, high),), _, _ = budget.overall
+    (share,), ((low, high),) = budget.overall.of_causes, budget.overall.of_causes_ci95
     assert low < share - 0.05
     assert high > share + 0.05
 
@@ -79,6 +79,5 @@ def test_without_causes_all_of_a_gap_is_left_however_small_it_is():
     cells = [Cell(trial, 0, trial % FOLDS, 50) for trial in range(6)]
     before = np.full(6, 51.0)  # 2 % above the noise, below the least gap that shares are relative to
     budget = Budget(cells, before, before, np.empty((0, 6)), frozenset({0}), CHANNELS)
-    _, _, left, ends = budget.overall
-    assert (left, ends) == (1.0, (1.0, 1.0))
+    assert (budget.overall.left, budget.overall.left_ci95) == (1.0, (1.0, 1.0))
     assert budget.of([0])[1] == 1.0
