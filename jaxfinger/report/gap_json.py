@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxfinger.data.atomic import atomic_path, make_folder
 from jaxfinger.effects import Site
-from jaxfinger.gap.result import Cause, Diagnosis, Key, Value
+from jaxfinger.gap.result import Candidate, Cause, Diagnosis, Key, NextExperiment, Value
 from jaxfinger.identify.fit_file import save_fit
 from jaxfinger.report import sentences
 
@@ -16,90 +16,36 @@ SCHEMA = "jaxfinger-gap/2"
 
 def as_gap_json(d: Diagnosis) -> dict:
     """Content of `gap.json` as a dictionary."""
-    step = d.next_experiment
     return {
         "schema": SCHEMA,
-        "data": d.data,
-        "specimen": d.specimen,
-        "against": d.against,
+        **_of(d, "data", "specimen", "against"),
         "verdict": {
             "status": str(d.status),
             "effects": [_key(k) for k in d.named],
             "summary": sentences.summary(d),
         },
-        "budget": [
-            {
-                "effect": c.effect,
-                "site": _sites(c),
-                "probability": _chance(c.probability),
-                "share": c.share,
-                "share_ci95": list(c.share_ci95),
-                "channels": {f"{k.experiment}/{k.name}": share for k, share in c.channels.items()},
-                "parameters": _parameters(c.values, c.sites),
-            }
-            for c in d.budget
-        ],
+        "budget": [_cause(c) for c in d.budget],
         "unexplained": {
             "share": d.unexplained.share,
             "share_ci95": list(d.unexplained.share_ci95),
             "depends_on": list(d.unexplained.depends_on),
             "proposal": d.unexplained.proposal.formula if d.unexplained.proposal else None,
         },
-        "relevance": [
-            {
-                "experiment": x.experiment,
-                "channel": x.channel,
-                "units": x.units,
-                "gap": x.gap,
-                "signal": x.signal,
-                "relative": x.relative,
-            }
-            for x in d.relevance
-        ],
-        "not_judged": [
-            {"experiment": x.experiment, "channel": x.channel, "reason": sentences.reason(x)} for x in d.not_judged
-        ],
+        "relevance": [_of(x, "experiment", "channel", "units", "gap", "signal", "relative") for x in d.relevance],
+        "not_judged": [_of(x, "experiment", "channel") | {"reason": sentences.reason(x)} for x in d.not_judged],
         "where": [
-            {
-                "experiment": p.experiment,
-                "trial": p.trial,
-                "channel": p.channel,
-                "site": p.site,
-                "region": {"variable": p.variable, "low": p.low, "high": p.high},
-                "share": p.share,
-            }
+            _of(p, "experiment", "trial", "channel", "site")
+            | {"region": _of(p, "variable", "low", "high"), "share": p.share}
             for p in d.where
         ],
-        "candidates": [
-            _key(c.key)
-            | {
-                "probability": _chance(c.probability),
-                "parameters": _parameters(c.values, (c.key.site,)),
-                "held_out_gain": c.held_out,
-            }
-            for c in d.candidates
-        ],
+        "candidates": [_candidate(c) for c in d.candidates],
         "none": _chance(d.none),
         "unlisted": _chance(d.unlisted),
         "ambiguous_sets": [[_key(k) for k in members] for members in d.ambiguous_sets],
-        "next_experiment": None
-        if step is None
-        else {
-            "experiment": step.experiment,
-            "description": sentences.next_trial(step),
-            "separates": list(step.separates),
-        },
+        "next_experiment": _next(d.next_experiment) if d.next_experiment else None,
         "gap": [
-            {
-                "experiment": x.experiment,
-                "channel": x.channel,
-                "units": x.units,
-                "noise": x.noise,
-                "before": x.before,
-                "after": x.after,
-                "closed": x.closed,
-                "closed_ci95": list(x.closed_ci95),
-            }
+            _of(x, "experiment", "channel", "units", "noise", "before", "after", "closed")
+            | {"closed_ci95": list(x.closed_ci95)}
             for x in d.closures
         ],
     }
@@ -123,6 +69,39 @@ def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
     save_fit(d.augmented, folder / "augmented.json", overwrite)
 
 
+def _cause(c: Cause) -> dict:
+    return {
+        "effect": c.effect,
+        "site": _sites(c),
+        "probability": _chance(c.probability),
+        "share": c.share,
+        "share_ci95": list(c.share_ci95),
+        "channels": {f"{k.experiment}/{k.name}": share for k, share in c.channels.items()},
+        "parameters": _parameters(c.values, c.sites),
+    }
+
+
+def _candidate(c: Candidate) -> dict:
+    return _key(c.key) | {
+        "probability": _chance(c.probability),
+        "parameters": _parameters(c.values, (c.key.site,)),
+        "held_out_gain": c.held_out,
+    }
+
+
+def _next(step: NextExperiment) -> dict:
+    return {
+        "experiment": step.experiment,
+        "description": sentences.next_trial(step),
+        "separates": list(step.separates),
+    }
+
+
+def _of(record: object, *names: str) -> dict:
+    """Fields of a record under their own names."""
+    return {name: getattr(record, name) for name in names}
+
+
 def _chance(probability: float) -> float:
     """A probability clipped to 0 and 1, since rounding may lift a sum of weights above 1."""
     return min(max(probability, 0.0), 1.0)
@@ -140,10 +119,5 @@ def _sites(cause: Cause) -> list[str]:
 def _parameters(values: tuple[Value, ...], sites: tuple[Site, ...]) -> dict:
     """Values by the parameter's name, or with several sites by name and site."""
     return {
-        v.name if len(sites) == 1 else f"{v.name} {'-'.join(v.site)}": {
-            "value": v.value,
-            "std": v.std,
-            "units": v.units,
-        }
-        for v in values
+        v.name if len(sites) == 1 else f"{v.name} {'-'.join(v.site)}": _of(v, "value", "std", "units") for v in values
     }
