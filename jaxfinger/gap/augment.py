@@ -20,7 +20,7 @@ from jaxfinger.gap.signatures import Signatures
 from jaxfinger.identify import Fit
 from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.intervals import evidence, laplace
-from jaxfinger.identify.parameters import describe, ravel, units_at
+from jaxfinger.identify.parameters import describe, effect_parameter, ravel, units_at
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
 from jaxfinger.model import Model
@@ -81,7 +81,7 @@ def as_refitted(baseline: Baseline, problem: Problem, chosen: SearchState, hold:
     for c, column in zip(state.coordinates, slopes, strict=True):
         effect = state.effects[c.effect]
         unit = c.unit if c.by_differences else float(getattr(effect, c.name))
-        columns[f"{effect.ID} {'-'.join(effect.site)} {c.name}"] = column / unit
+        columns[effect_parameter(effect, c.name)] = column / unit
     moving = np.array([i for i in moving if labels[i] in columns], int)
     r = there.r - change
     J = np.column_stack([there.J, *(columns[labels[i]] for i in moving)])
@@ -236,7 +236,7 @@ def values_of(fit: Fit, index: int) -> tuple[Value, ...]:
     """Values and standard deviations of all parameters of the fit's effect number `index`."""
     effect = fit.model.effects[index]
     assert isinstance(effect, CatalogueEffect)
-    label = f"{effect.ID} {'-'.join(effect.site)} "
-    std = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
+    every = {p.name: s for p, s in zip(describe(fit.model), fit.std, strict=True)}
+    std = {n: float(every[effect_parameter(effect, n)]) for n in effect.values()}
     units = units_at(fit.model.finger, type(effect), effect.site)
-    return tuple(Value(effect.site, n, v, float(std.get(label + n, 0.0)), units[n]) for n, v in effect.values().items())
+    return tuple(Value(effect.site, n, v, std[n], units[n]) for n, v in effect.values().items())

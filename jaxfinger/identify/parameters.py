@@ -159,6 +159,11 @@ def units_at(finger: Finger, effect: type[CatalogueEffect], site: Site) -> dict[
     return {k: u if u == "rad" else units_where(u, finger.prismatic) for k, u in effect.units().items()}
 
 
+def effect_parameter(effect: CatalogueEffect, name: str) -> str:
+    """`Parameter.name` of an effect's parameter, unique among effects and sites."""
+    return f"{effect.ID} {'-'.join(effect.site)} {name}"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One entry of the flat vector."""
@@ -239,7 +244,7 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
         case ["effects", int(i), field]:
             effect = model.effects[i]
             assert isinstance(effect, CatalogueEffect)
-            label = f"{effect.ID} {'-'.join(effect.site)} {field}"
+            label = effect_parameter(effect, field)
             units = units_at(model.finger, type(effect), effect.site)
             if index or field not in units:  # a constant of the effect
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
