@@ -19,21 +19,20 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError, require
 from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
-from jaxfinger.identify.identifiability import name_invisible, name_traded
 from jaxfinger.identify.parameters import Free, describe, ravel
-from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
-from jaxfinger.identify.solve import Solution, Source, parameter_bounds, solve
+from jaxfinger.identify.solve import Solution, Source, solve
 from jaxfinger.identify.stages import (
     Progress,
     cad_covariance,
     cad_prior,
     estimate_with_noise,
     free_groups,
+    name_doubtful,
     report_of,
     sources_of,
     total_cost,
@@ -80,10 +79,9 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
             f"{session.file or 'the session'}: has no trial of {', '.join(recipe.fit.joint_experiments)}; "
             "name others in fit.joint_experiments of the recipe"
         )
-    parameters, free = describe(model), _free(fit, model, session, reads)
-    same = fit.was_made_from(session)
+    free, same = _free(fit, model, session, reads), fit.was_made_from(session)
     if same:
-        prior = cad_prior(session, recipe, parameters, free)
+        prior = cad_prior(session, recipe, describe(model), free)
     else:
         prior = prior_of(np.asarray(ravel(fit.model)), fit.covariance, free)
     progress("refining on all trials at once")
@@ -101,12 +99,10 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
         for x in not_judged(stacks)
         if x.channel in reads[x.experiment]
     ]
-    warnings += name_invisible(parameters, free, solution.invisible)
     if better:
         warnings.append("the earlier fit led to a poorer optimum")
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
-    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
-    warnings += implausible(model, covariance, free, parameter_bounds(start, free)[0])
+    warnings += name_doubtful(model, start, solution, covariance, free)
     refined = replace(
         fit.made_from(session, alone=same),
         model=model,
@@ -151,18 +147,16 @@ def _better_from_neutral_start(
 
 def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Prior, before: np.ndarray) -> Fit:
     """Refine a joint fit, made from `sources`, on VD.3 too; `before` is the covariance before the joint fit."""
-    free, huber, parameters = fit.estimated, fit.recipe.fit.huber, describe(fit.model)
+    free, huber = fit.estimated, fit.recipe.fit.huber
     noise = {(AHEAD, "q"): starts.noise(fit.model)}
-    sources = sources | sources_of({AHEAD: starts.stack}, {AHEAD: ("q",)}, noise, parameters)
+    sources = sources | sources_of({AHEAD: starts.stack}, {AHEAD: ("q",)}, noise, describe(fit.model))
     first, _ = solve(fit.model, free, sources, prior, huber)
     sources[AHEAD] = sources[AHEAD]._replace(batch=starts.corrected(first))
     model, solution = solve(first, free, sources, prior, huber)
     covariance = propagate(before, model, solution, sources, free, prior, huber)
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
     covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
-    warnings = name_invisible(parameters, free, solution.invisible)
-    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
-    warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
+    warnings = name_doubtful(model, fit.model, solution, covariance, free)
     refined = replace(fit, model=model, covariance=covariance)
     report = report_of(
         AHEAD, solution, free, starts.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
@@ -283,13 +283,31 @@ def run_stage(
     read = np.unique(np.concatenate([s.positions for s in sources.values()]))
     needed = read[[parameters[i].group in free_groups(recipe) for i in read]]
     warnings = constant + name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
-    warnings += name_invisible(parameters, free, solution.invisible)
     warnings += name_unseen(parameters, groups, free)
-    warnings += name_traded(parameters, np.asarray(ravel(model)), covariance, free)
-    warnings += implausible(model, covariance, free, parameter_bounds(fit.model, free)[0])
+    warnings += name_doubtful(model, fit.model, solution, covariance, free)
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)
     return replace(fit, model=model, covariance=covariance, estimated=fitted, noise=noise, stages=(*fit.stages, report))
+
+
+def name_doubtful(
+    model: Model,
+    start: Model,
+    solution: Solution,
+    covariance: Float[np.ndarray, "P P"],
+    free: Int[np.ndarray, " p"],
+) -> list[str]:
+    """Warnings of estimates that the trials do not show, or only together, and of those that no machine can have.
+
+    `start`: the model from which the fit went, whose masses bound those of `model`.
+    """
+    parameters = describe(model)
+    lightest, _ = parameter_bounds(start, free)
+    return [
+        *name_invisible(parameters, free, solution.invisible),
+        *name_traded(parameters, np.asarray(ravel(model)), covariance, free),
+        *implausible(model, covariance, free, lightest),
+    ]
 
 
 def report_of(
