@@ -24,6 +24,7 @@ from jaxfinger.experiments import Batch
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import TANGENTS_AT_ONCE, VisibleGaussNewton
 from jaxfinger.identify.linearise import Filters, robust_residuals, white_rows
+from jaxfinger.identify.nominal import cad_covariance, cad_prior, nominal_model
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel, with_flat
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.resample import (
@@ -39,7 +40,7 @@ from jaxfinger.identify.resample import (
     variances,
 )
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
-from jaxfinger.identify.stages import cad_covariance, cad_prior, nominal_model, sources_of
+from jaxfinger.identify.stages import sources_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these

@@ -26,11 +26,12 @@ from jaxfinger.experiments import Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.joint import JOINT, joint_channels
 from jaxfinger.identify.linearise import linearise, triangular
+from jaxfinger.identify.nominal import cad_covariance, cad_prior
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
 from jaxfinger.identify.solve import Source, visible
-from jaxfinger.identify.stages import STAGES, cad_covariance, cad_prior, sources_of, stage_free
+from jaxfinger.identify.stages import STAGES, sources_of, stage_free
 from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]

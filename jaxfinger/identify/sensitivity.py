@@ -32,12 +32,12 @@ from jaxfinger.experiments import Batch, Stack
 from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.gauss_newton import scaled_directions
 from jaxfinger.identify.linearise import Filters, robust_residuals, white_rows
+from jaxfinger.identify.nominal import cad_covariance, cad_prior
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.resample import read_again
 from jaxfinger.identify.solve import Source
-from jaxfinger.identify.stages import cad_covariance, cad_prior
 from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"

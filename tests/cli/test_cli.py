@@ -19,7 +19,7 @@ from jaxfinger.data import read_session
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe, load_fit, refine, save_fit
-from jaxfinger.identify.stages import nominal_model
+from jaxfinger.identify.nominal import nominal_model
 from jaxfinger.report.numbers import number
 
 ROOT = Path(__file__).parents[2]

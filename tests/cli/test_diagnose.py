@@ -9,7 +9,7 @@ from jaxfinger.data import read_session, write_predictions
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.fit_file import save_fit
-from jaxfinger.identify.stages import nominal_model
+from jaxfinger.identify.nominal import nominal_model
 
 
 @pytest.mark.parametrize("name", ["gap.json", "nominal.json", "augmented.json", "report.html"])

@@ -17,7 +17,7 @@ from jaxfinger.gap.signatures import whitened
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.noise import whiten
-from jaxfinger.identify.stages import nominal_model
+from jaxfinger.identify.nominal import nominal_model
 from jaxfinger.report.sentences import summary
 
 from .conftest import PLANTED, RIVALS, TRUTH, WITHOUT, session_with

@@ -11,8 +11,8 @@ import pytest
 
 from jaxfinger.errors import UserError
 from jaxfinger.identify import compress, fit_many, identify, refit
+from jaxfinger.identify.nominal import nominal_model
 from jaxfinger.identify.parameters import ravel
-from jaxfinger.identify.stages import nominal_model
 from jaxfinger.identify.uncertainty import draw_weights
 from jaxfinger.synthetic import measure
 

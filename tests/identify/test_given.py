@@ -8,9 +8,9 @@ import pytest
 from jaxfinger.data import Session
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Recipe
+from jaxfinger.identify.nominal import cad_prior, free_groups, nominal_model
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.recipe import PAPER, ModelRecipe, structure
-from jaxfinger.identify.stages import cad_prior, free_groups, nominal_model
 from jaxfinger.synthetic import paper_finger
 
 FINGER = paper_finger().description

@@ -10,11 +10,12 @@ import pytest
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
+from jaxfinger.identify.nominal import cad_prior, nominal_model
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.sensitivity import sensitivity
 from jaxfinger.identify.solve import solve
-from jaxfinger.identify.stages import cad_prior, nominal_model, sources_of
+from jaxfinger.identify.stages import sources_of
 
 pytestmark = pytest.mark.long
 
