@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from jaxfinger.data.signals.noise import HALF_95
 from jaxfinger.identify.gauss_newton import MIN_RELATIVE_SINGULAR_VALUE
 from jaxfinger.identify.parameters import Parameter
-from jaxfinger.identify.plausible import Z95
 from jaxfinger.model import Finger, rigid_body
 
 # A combination whose relative singular value is smaller is weak: its interval is more than 1000 times as wide as that
@@ -134,7 +134,7 @@ def name_traded(
     known. Coefficients of one polynomial trade off in any trial of a short range, and say nothing of a law.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    unsure = [i for i in free if np.isfinite(std[i]) and std[i] > 0.0 and abs(values[i]) < Z95 * std[i]]
+    unsure = [i for i in free if np.isfinite(std[i]) and std[i] > 0.0 and abs(values[i]) < HALF_95 * std[i]]
     out: dict[tuple, str] = {}
     for k, i in enumerate(unsure):
         for j in unsure[:k]:

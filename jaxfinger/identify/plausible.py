@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfinger.data.signals.noise import HALF_95
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.model import Model
 
-Z95 = 1.96  # standard deviations to either side of a 95 % interval; a wrong sign within it may be chance
 # What a negative value of a parameter would mean, by group.
 MEANING_IF_NEGATIVE = {
     "damping": "would drive the joint instead of damping it",
@@ -28,7 +28,7 @@ def implausible(
     out = []
     for i, floor in zip(free, lightest, strict=True):
         p = parameters[i]
-        if p.group in MEANING_IF_NEGATIVE and values[i] + Z95 * std[i] < 0.0:
+        if p.group in MEANING_IF_NEGATIVE and values[i] + HALF_95 * std[i] < 0.0:
             out.append(f"{_with_interval(p, values[i], std[i])}: {MEANING_IF_NEGATIVE[p.group]}")
         elif p.group == "mass" and values[i] <= 1.0001 * floor:
             out.append(
@@ -40,7 +40,7 @@ def implausible(
 
 
 def _with_interval(p: Parameter, value: float, std: float) -> str:
-    known = f" ± {Z95 * std:.2g}" if np.isfinite(std) else " ± ?"
+    known = f" ± {HALF_95 * std:.2g}" if np.isfinite(std) else " ± ?"
     return f"{p.name} is {value:.3g}{known} {p.units}".removesuffix(" 1")
 
 
@@ -55,11 +55,11 @@ def _negative_friction(model: Model, covariance, free, parameters) -> list[str]:
         q = np.linspace(low, high, 61)
         A = q[:, None] ** np.array([parameters[k].power for k in at])
         F, std = _with_std(A, np.asarray(ravel(model))[at], covariance[np.ix_(at, at)])
-        worst = int(np.argmin(F + Z95 * std))
-        if F[worst] + Z95 * std[worst] < 0.0:
+        worst = int(np.argmin(F + HALF_95 * std))
+        if F[worst] + HALF_95 * std[worst] < 0.0:
             unit, where = ("N", f"{q[worst]:.3g} m") if finger.prismatic[i] else ("N m", f"{np.degrees(q[worst]):.0f}°")
             out.append(
-                f"friction of joint {joint} is {F[worst]:.3g} ± {Z95 * std[worst]:.2g} {unit} at {where}: it would "
+                f"friction of joint {joint} is {F[worst]:.3g} ± {HALF_95 * std[worst]:.2g} {unit} at {where}: it would "
                 "push the joint on; record trials there, or give the recipe a lower degree"
             )
     return out
@@ -70,7 +70,7 @@ def _excess_losses(values: list[float], std: list[float], free, parameters: list
     return [
         f"{_with_interval(parameters[k], values[k], std[k])}: the tendon would lose more than is pulled"
         for k in free
-        if parameters[k].term == "proportional" and values[k] - Z95 * std[k] > 1.0
+        if parameters[k].term == "proportional" and values[k] - HALF_95 * std[k] > 1.0
     ]
 
 

@@ -9,7 +9,8 @@ import math
 import re
 from collections.abc import Sequence
 
-HALF_95 = 1.96  # Standard deviations from the mean to either end of a normal distribution's central 95 % interval.
+from jaxfinger.data.signals.noise import HALF_95
+
 # χ² per row above which the model or its noise is taken to be wrong: residuals of 1.22 times the noise.
 MAX_CHI2 = 1.5
 DASH = "–"

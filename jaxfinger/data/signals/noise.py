@@ -11,6 +11,7 @@ from jaxfinger.data.signals.quantiles import median
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+HALF_95 = 1.96  # standard deviations from the mean to either end of a normal distribution's central 95 % interval
 STD_PER_MAD = 1.4826  # standard deviation of Gaussian values, per median absolute deviation: 1/Φ⁻¹(3/4)
 
 
