@@ -226,13 +226,15 @@ def _relevance(x) -> dict:
 
 def _cards(d: Diagnosis) -> list[dict]:
     """A card for each cause of the budget and each rival; only rivals where the verdict is `ambiguous`."""
-    if d.status is Status.AMBIGUOUS and d.ambiguous_sets:
-        by_key = {c.key: c for c in d.candidates}
-        return [_rival(d, k, by_key.get(key), key) for k, key in enumerate(d.ambiguous_sets[0])]
-    cards, inside = [_card(d, k, c) for k, c in enumerate(d.budget)], {key for c in d.budget for key in c.keys}
-    rivals = [key for members in d.ambiguous_sets for key in members if key not in inside]
+    rivals_alone = d.status is Status.AMBIGUOUS and d.ambiguous_sets
+    causes, sets = ((), d.ambiguous_sets[:1]) if rivals_alone else (d.budget, d.ambiguous_sets)
+    inside = {key for c in causes for key in c.keys}
+    rivals = [key for members in sets for key in members if key not in inside]
     by_key = {c.key: c for c in d.candidates}
-    return cards + [_rival(d, len(cards) + k, by_key.get(key), key) for k, key in enumerate(rivals)]
+    return [
+        *(_card(d, k, c) for k, c in enumerate(causes)),
+        *(_rival(d, k, by_key.get(key), key) for k, key in enumerate(rivals, len(causes))),
+    ]
 
 
 def _card(d: Diagnosis, k: int, c: Cause) -> dict:
