@@ -86,7 +86,7 @@ def compress(session: Session, fit: Fit) -> Compressed:
         A = np.concatenate([b[:, free] for b, w in zip(blocks, reads[k], strict=True) if w])
         basis = np.zeros((P, 0))
         if A.size:
-            small, _, _ = visible(triangular(A))
+            small, _ = visible(triangular(A))
             basis = np.zeros((P, small.shape[1]))
             basis[free] = small
         bases.append(basis)

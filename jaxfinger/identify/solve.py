@@ -116,7 +116,7 @@ class Solution:
     @cached_property
     def invisible(self) -> Float[np.ndarray, "i p"]:
         """Unit vectors of scaled parameters along the invisible combinations."""
-        return visible(self.jacobian)[1]
+        return visible(self.jacobian)[1].T
 
     @cached_property
     def linearised(self) -> dict[str, Linearised]:
@@ -212,7 +212,7 @@ def solve(
     low, high = parameter_bounds(model, free, limits)
     prior = prior or Prior.none(theta)
     affine = not huber and all(s.is_affine(model, free) for s in sources.values())
-    room = -(-max(p, 1) // PADDING) * PADDING
+    room = _room(p)
     y = _padded(theta, room)
     state = begin(y)
     how = np.asarray(tolerance), np.asarray(affine), _padded(low, room), _padded(high, room)
@@ -279,6 +279,11 @@ def _sentence(outcome: str, state: Iterate, left: float) -> str:
     if outcome == RUNNING:
         return f"no end after {MAX_STEPS} linearisations; {last}"
     return f"{outcome}; {last}"
+
+
+def _room(p: int) -> int:
+    """Number of parameters to which a problem of `p` is padded."""
+    return max(-(-p // PADDING), 1) * PADDING
 
 
 def _padded(values: np.ndarray, room: int) -> Float[np.ndarray, " room"]:
@@ -415,13 +420,11 @@ def stacked(
     return out
 
 
-def visible(A: Float[np.ndarray, "k p"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Basis (p, v) of the visible combinations, the invisible ones (i, p), and the scale (p,) of the parameters."""
+def visible(A: Float[np.ndarray, "k p"]) -> tuple[Float[np.ndarray, "p v"], Float[np.ndarray, "p i"]]:
+    """Columns of steps along the visible combinations (`scaled_directions`), and of unit vectors along the others."""
     p = A.shape[1]
-    basis, _, seen, V, scale = map(
-        np.asarray, scaled_directions(np.concatenate([A, np.zeros((max(0, p - len(A)), p))]))
-    )
-    return basis[:, seen], V[:, ~seen].T, scale
+    basis, _, seen, V, _ = scaled_directions(np.concatenate([A, np.zeros((max(0, p - len(A)), p))]))
+    return basis[:, seen], V[:, ~seen]
 
 
 def bounded_least_squares(
@@ -429,7 +432,7 @@ def bounded_least_squares(
 ) -> np.ndarray:
     """Minimum δ of ‖A δ + b‖ over low ≤ δ ≤ high, by `gauss_newton.bounded_step`; bounds that exclude 0 move to 0."""
     p = A.shape[1]
-    room = -(-max(p, 1) // PADDING) * PADDING
+    room = _room(p)
     ends = (_padded(np.broadcast_to(e, p), room) for e in (low, high))
     return np.asarray(_bounded(_factor_of(np.column_stack([A, b]), room), *ends))[:p]
 
