@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from jaxfinger.errors import counted
+from jaxfinger.errors import counted, listed
 
 Severity = Literal["error", "warning", "note"]
 
@@ -62,12 +62,13 @@ _PLACES = (
     ("trial", re.compile(r"trials\.(.+?)(\.(?:channels|time)(?:\..*)?)?")),  # of a mapping; a name may hold dots
     ("recording", re.compile(rf"(?:.*[/\\])?([^/\\]+\.(?:{_ENDINGS}))()", re.IGNORECASE)),
 )
+_NAMED = 3  # of the others that share a finding: a line holds so many names
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?%?")
 
 
-def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
+def merged(findings: Iterable[Finding]) -> list[Finding]:
     """Merge findings that several trials or recordings share: the finding of the first one, and the names of the next
-    `named` ones.
+    `_NAMED` ones.
 
     Findings are shared if they differ in nothing but trials, recordings and numbers.
     """
@@ -81,8 +82,7 @@ def merged(findings: Iterable[Finding], named: int = 3) -> list[Finding]:
     for (first, kind, own), *others in alike.values():
         names = list(dict.fromkeys(name for *_, name in others if name != own))
         if names:
-            rest = f" and {len(names) - named} more" if len(names) > named else ""
-            also = f" (likewise in {counted(len(names), f'other {kind}')}: {', '.join(names[:named])}{rest})"
+            also = f" (likewise in {counted(len(names), f'other {kind}')}: {listed(names, _NAMED)})"
             first = replace(first, message=first.message + also)
         out.append(first)
     return out

@@ -176,9 +176,9 @@ MATRIX = (
 )  # fmt: skip
 
 
-def stream(rig: RigDescription, phase: str, seed: int = 0) -> Block:
+def stream(rig: RigDescription, phase: str) -> Block:
     """Return LENGTH samples of a sound finger in a phase; sample BEGIN lies within it."""
-    rng, finger, k = np.random.default_rng(seed), rig.finger, np.arange(LENGTH)
+    rng, finger, k = np.random.default_rng(0), rig.finger, np.arange(LENGTH)
     seconds = np.maximum(k - BEGIN, 0) / rig.rate_hz
     state, wanted = {
         "arming": (np.where(k < BEGIN - ARMED_BEFORE, State.IDLE, State.ARMED), 0.0 * k),

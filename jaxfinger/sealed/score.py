@@ -49,11 +49,11 @@ class Scores:
         return asdict(self)
 
 
-def wilson(hits: int, count: int, z: float = Z95) -> Figure:
+def wilson(hits: int, count: int) -> Figure:
     """Share with Wilson's score interval (Wilson 1927), which stays within [0, 1] and keeps a width at 0 and 1."""
     if count == 0:
         return Figure(float("nan"), float("nan"), float("nan"), 0)
-    p = hits / count
+    p, z = hits / count, Z95
     centre = (p + z**2 / (2 * count)) / (1 + z**2 / count)
     half = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
     return Figure(p, float(max(centre - half, 0.0)), float(min(centre + half, 1.0)), count)

@@ -30,6 +30,7 @@ MIN_SEVERITY = 1e-9  # of a departure without any trace: its logarithm has to ex
 SLIDING_SPEED = (
     0.03  # rad/s, a tenth of the slowest sweep of `protocols`. Speeds carry no noise here, as they do in `closure`.
 )
+MAX_RESIZES = 8  # steps of the search for a departure's size, which bound its time; the nearest one reached is taken
 TAUT_TENSION = 0.3  # N, above which a tendon counts as taut: 15 times the noise of its sensor
 
 
@@ -284,7 +285,7 @@ def severity(session: NoiseFreeSession, departures: Sequence[Departure]) -> tupl
 
 
 def calibrate(
-    session: NoiseFreeSession, departure: Departure, target: float, attempts: int = 8
+    session: NoiseFreeSession, departure: Departure, target: float
 ) -> tuple[Departure, float, tuple[str, str, int]]:
     """Resize a departure until its severity is within a tenth of `target`, or its size at a physical limit.
 
@@ -293,7 +294,7 @@ def calibrate(
     low = high = None  # (log size, log severity) below and above the target
     best = None
     size = departure.size
-    for _ in range(attempts):
+    for _ in range(MAX_RESIZES):
         current = departure.resized(size)
         reached, where = severity(session, [current])
         if best is None or abs(np.log(reached / target)) < abs(np.log(best[1] / target)):

@@ -19,18 +19,21 @@ if TYPE_CHECKING:
 # Largest second difference as a multiple of the mean one. That of Gaussian noise stays below it, so a column below it
 # has no spikes to look for.
 _MAX_NOISE_BEND = 12.0
+# Standard deviations of noise. With σ the noise of a sample, the straight line through the two samples on one side is
+# √6 σ off: 8 σ is 3.3 times that, and a spike must be so far from the line on the other side, too.
+_MIN_SPIKE_TO_NOISE = 8.0
 _MAX_PASSES = 4  # Each pass finds spikes that those found before had hidden; longer chains of them are rare.
 _END_SAMPLES = 10  # at each end, whose steps show how fast a motion starts or stops
 _MIN_SPIKE_SHARE = 1e-4  # of a column's travel: a smaller deviation is no spike, even where the column has no noise.
 
 
-def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: int = 5) -> Bool[np.ndarray, "N *k"]:
+def outlier_mask(x: Float[np.ndarray, "N *k"], longest: int = 5) -> Bool[np.ndarray, "N *k"]:
     """Mark spikes: samples that no motion seen before and after them leads to.
 
     A sample of a motion lies within the range of its two neighbours and of the straight lines through the two samples
     on either side. Smooth turns, corners and steps stay within that range at any sampling rate. A spike is outside by
-    more than `threshold` times the noise. The noise is a robust standard deviation, and at least the
-    sensor's resolution, so that a quantised channel at rest has no spikes. NaN is no spike.
+    more than `_MIN_SPIKE_TO_NOISE` times the noise. The noise is a robust standard deviation, and at least the sensor's
+    resolution, so that a quantised channel at rest has no spikes. NaN is no spike.
 
     Spikes of up to `longest` samples are found, in up to about one sample in ten.
     """
@@ -41,7 +44,7 @@ def outlier_mask(x: Float[np.ndarray, "N *k"], threshold: float = 8.0, longest: 
         good = np.isfinite(column)
         values = column[good]
         if len(values) > 2 * longest:
-            mask[good, k] = _spikes(values, threshold, longest)
+            mask[good, k] = _spikes(values, longest)
     return mask.reshape(x.shape)
 
 
@@ -72,12 +75,12 @@ def bridged(x: Float[np.ndarray, "N k"], spikes: Bool[np.ndarray, "N k"]) -> Flo
     return out
 
 
-def _spikes(values: Float[np.ndarray, " N"], threshold: float, longest: int) -> Bool[np.ndarray, " N"]:
+def _spikes(values: Float[np.ndarray, " N"], longest: int) -> Bool[np.ndarray, " N"]:
     """Mark the spikes of one finite column (`outlier_mask`)."""
     # Second differences show the noise in motion and at rest. Their mean is about zero, their variance 6 σ².
     noise = STD_PER_MAD * median(np.abs(np.diff(values, 2))) / np.sqrt(6.0)
     noise = max(noise, resolution(values), _MIN_SPIKE_SHARE * np.ptp(values))
-    spikes, least = np.zeros(len(values), bool), threshold * noise
+    spikes, least = np.zeros(len(values), bool), _MIN_SPIKE_TO_NOISE * noise
     sound = values
     for _ in range(_MAX_PASSES):  # A spike bends the lines beside it, so its neighbours are judged again without it.
         found = _beyond(sound, least, longest) & ~spikes

@@ -150,9 +150,9 @@ def started(
 
 
 @contextmanager
-def running(speed: float = 1.0, heartbeat: float = 0.25, seed: int = 0, filtered: bool = False) -> Iterator[str]:
+def running(speed: float = 1.0, heartbeat: float = 0.25) -> Iterator[str]:
     """Start a stand-in as `started` does. Yield host:port, for `ip` in the rig file."""
-    with started(speed, heartbeat, seed, filtered) as bench:
+    with started(speed, heartbeat) as bench:
         yield bench.where
 
 
