@@ -119,31 +119,53 @@ def planned_tension(nominal: Finger, plan: Plan, t: Float[np.ndarray, " N"]) -> 
     return np.stack([allocate(*row) for row in zip(arms, torque, direction, strict=True)])
 
 
+class Controller:
+    """Track one plan: the nominal finger's torque, and a spring and a damper towards the desired motion."""
+
+    def __init__(self, nominal: Finger, plan: Plan, time: Float[np.ndarray, " K"]):
+        self.q, self.qd, qdd = (np.stack(x, axis=1) for x in zip(*(p(time) for p in plan.q), strict=True))
+        self._torque, self._direction = feedforward(nominal, self.q, self.qd, qdd)
+        self._nominal, self._allocate = nominal, Allocator(nominal, plan.least)
+
+    def __call__(
+        self,
+        cycle: int,
+        q: Float[np.ndarray, " m"],
+        qd: Float[np.ndarray, " m"],
+        stiff: Float[np.ndarray, " m"],
+        damp: Float[np.ndarray, " m"],
+    ) -> Float[np.ndarray, " n"]:
+        """Tension to command in a cycle, N, with a spring `stiff`, N m/rad, and a damper `damp`, N m s/rad."""
+        torque = self._torque[cycle] + stiff * (self.q[cycle] - q) + damp * (self.qd[cycle] - qd)
+        return self._allocate(self._nominal.geometry(q)[1], torque, self._direction[cycle])
+
+
+def _gains(nominal: Finger, q: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Spring and damper of each joint: at posture q every joint is damped to 0.6 of the critical damping.
+
+    A very light joint, below 2e-6 kg m², has the damper of one that heavy.
+    """
+    inertia = np.diag(nominal.plant.mass_matrix(q))
+    stiff = 0.03 + 0.05 * inertia / inertia.max()
+    return stiff, 1.2 * np.sqrt(stiff * np.maximum(inertia, 2e-6))
+
+
 def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run]:
-    """Simulate the VD.3 trials together. All must have the same duration."""
+    """Simulate the VD.3 trials together. All must have the same duration. Gains of the first posture serve all."""
     if not plans:
         return []
     model = finger.plant.model
     active = np.flatnonzero(finger.specimen.finger.active)
     batch, m, n = len(plans), finger.m, finger.n
     fine = sample_times(plans[0], 1 / (STEP * CONTROL))
-    desired = [[np.stack(x, axis=1) for x in zip(*(p(fine) for p in plan.q), strict=True)] for plan in plans]
-    forward = [feedforward(nominal, *w) for w in desired]
     noises = np.stack([_wander(np.random.default_rng(plan.seed), len(fine), n, STEP * CONTROL) for plan in plans])
-    allocate = [Allocator(nominal, plan.least) for plan in plans]
-    inertia = np.diag(nominal.plant.mass_matrix(desired[0][0][0]))
-    stiff = 0.03 + 0.05 * inertia / inertia.max()
-    damp = 1.2 * np.sqrt(stiff * np.maximum(inertia, 2e-6))
+    controllers = [Controller(nominal, plan, fine) for plan in plans]
+    gains = _gains(nominal, controllers[0].q[0])
 
     data = [mujoco.MjData(model) for _ in plans]
-    for d, w in zip(data, desired, strict=True):
-        d.qpos = w[0][0]
-    f = np.stack(
-        [
-            a(nominal.geometry(w[0][0])[1], ff[0][0], ff[1][0])
-            for a, w, ff in zip(allocate, desired, forward, strict=True)
-        ]
-    )
+    for d, c in zip(data, controllers, strict=True):
+        d.qpos = c.q[0]
+    f = np.stack([c(0, c.q[0], c.qd[0], *gains) for c in controllers])
     command, starts = f.copy(), np.array([plan.start for plan in plans])
     q = np.stack([d.qpos.copy() for d in data])
     qd = np.zeros_like(q)
@@ -153,12 +175,10 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
 
     for i in range(len(fine) * CONTROL):
         if i % CONTROL == 0:
-            c = i // CONTROL
-            for b in range(batch):
-                w = desired[b]
-                torque = forward[b][0][c] + stiff * (w[0][c] - q[b]) + damp * (w[1][c] - qd[b])
-                command[b] = allocate[b](nominal.geometry(q[b])[1], torque, forward[b][1][c])
-            command = command * (1 + 0.004 * noises[:, c]) + 0.02 * noises[:, c] * (command > 0)
+            k = i // CONTROL
+            command = np.stack([c(k, *motion, *gains) for c, *motion in zip(controllers, q, qd, strict=True)])
+            # The commanded tension wanders by 0.4 % and 0.02 N about that.
+            command = command * (1 + 0.004 * noises[:, k]) + 0.02 * noises[:, k] * (command > 0)
         f = f + (command - f) * (STEP / LAG)
         t = np.full(batch, i * STEP)
         s = Situation(t, starts + t, q, qd, np.zeros_like(q), f, np.sign(qd), memory=memory)
@@ -168,7 +188,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
             z = d.start(u[None]) if i == 0 else d.step(memory[id(d)], driven[id(d)], u, STEP)
             memory[id(d)], driven[id(d)] = z, u
         if i % CONTROL == 0:
-            keep_q[i // CONTROL], keep_qd[i // CONTROL], keep_f[i // CONTROL] = q, qd, f
+            keep_q[k], keep_qd[k], keep_f[k] = q, qd, f
         q, qd = _advance(finger, s, data, active)
     return [Run(fine, keep_q[:, b], keep_qd[:, b], keep_f[:, b]) for b in range(batch)]
 
