@@ -402,79 +402,91 @@ def as_newer_matlab(old: Path, new: Path) -> None:
 
 def run_mutations(number: int) -> None:
     """Run mutated mappings and recordings through `import`, and mutated sessions through `check`."""
-    sys.path.insert(0, str(ROOT))
+    sys.path.insert(0, str(ROOT))  # for `docs` and `tests`
+    with tempfile.TemporaryDirectory() as name:
+        mutate_texts(number, Path(name))
+        mutate_recordings(number // 4, Path(name))
+        mutate_sessions(number, Path(name))
+
+
+def mutate_texts(number: int, folder: Path) -> None:
+    """Count what becomes of mutated mappings and finger files of docs/your-own-data.md, with their sound recordings."""
     from docs.own_data_logs import main as write_own_data_logs
+
+    write_own_data_logs(folder)
+    guide = (ROOT / "docs" / "your-own-data.md").read_text(encoding="utf-8")
+    for block, text in re.findall(r"^```toml (\S+)\n(.*?)^```", guide, re.M | re.S):
+        (folder / block).write_text(text)
+    logs, out = [str(path) for path in sorted(folder.glob("*.csv"))], folder / "out.h5"
+
+    for kind, times, source, target, mapping in (
+        ("mappings", number, "mapping.toml", "mutated.toml", "mutated.toml"),
+        ("fingers", number // 4, "finger.toml", "finger.toml", "mapping.toml"),
+    ):
+        sound = (folder / source).read_text()
+
+        def of_text(rng: np.random.Generator | None, sound=sound, target=target, mapping=mapping):
+            (folder / target).write_text(mutated_text(sound, rng) if rng else sound)
+            return ["import", *logs, "--mapping", str(folder / mapping), "-o", str(out)], out
+
+        count(kind, times, of_text)
+
+
+def mutate_recordings(number: int, folder: Path) -> None:
+    """Count what becomes of mutated recordings of each format, with their sound mappings."""
+    cases, out = ROOT / "tests" / "data" / "cases", folder / "out.h5"
+    as_newer_matlab(cases / "simulink-signal-of-two-columns", folder / "newer")
+    for kind, recording, mapped, mutate in (
+        ("CSV", cases / "csv-as-other-programs-write-it/quoted.csv", "quoted.toml", mutated_table),
+        ("CSV of Scope", cases / "csv-as-other-programs-write-it/scope.csv", "scope.toml", mutated_bytes),
+        ("MAT", cases / "simulink-signal-of-two-columns/log.mat", "m.toml", mutated_bytes),
+        ("MAT 7.3", folder / "newer/log.mat", "m.toml", mutated_bytes),
+        ("MCAP", cases / "one-message-at-time-zero/log.mcap", "m.toml", mutated_bytes),
+        ("bag", cases / "joint-states-of-two-publishers/log", "m.toml", mutated_bytes),
+    ):
+        target = folder / "mutated" / recording.name
+        shutil.rmtree(folder / "mutated", ignore_errors=True)
+        (folder / "mutated").mkdir()
+        if recording.is_dir():
+            shutil.copytree(recording, target, copy_function=shutil.copyfile)
+            target.chmod(0o755)
+        inner = next(target.glob("*.db3")) if recording.is_dir() else target
+        raw = (next(recording.glob("*.db3")) if recording.is_dir() else recording).read_bytes()
+        text = (recording.parent / mapped).read_text()
+        text = text.replace('time = "t"', 'time = "q.time"') if kind == "CSV of Scope" else text
+        text = text.replace("column = 0", 'column = "J"') if kind == "bag" else text
+        (folder / "case.toml").write_text(text)
+
+        def of_recording(rng: np.random.Generator | None, inner=inner, raw=raw, mutate=mutate, target=target):
+            inner.write_bytes(mutate(raw, rng) if rng else raw)
+            return ["import", str(target), "--mapping", str(folder / "case.toml"), "-o", str(out)], out
+
+        count(kind, number, of_recording)
+
+
+def mutate_sessions(number: int, folder: Path) -> None:
+    """Count what becomes of sessions whose HDF5 structure or bytes are mutated."""
     from tests.data.conftest import make_session
 
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        out = folder / "out.h5"
-        write_own_data_logs(folder)
-        guide = (ROOT / "docs" / "your-own-data.md").read_text(encoding="utf-8")
-        for block, text in re.findall(r"^```toml (\S+)\n(.*?)^```", guide, re.M | re.S):
-            (folder / block).write_text(text)
-        logs = [str(path) for path in sorted(folder.glob("*.csv"))]
-        mapping = (folder / "mapping.toml").read_text()
+    session = folder / "session.h5"
+    write_session(make_session(), session)
+    raw = session.read_bytes()
 
-        def of_mapping(rng: np.random.Generator | None):
-            (folder / "mutated.toml").write_text(mutated_text(mapping, rng) if rng else mapping)
-            return ["import", *logs, "--mapping", str(folder / "mutated.toml"), "-o", str(out)], out
+    def of_structure(rng: np.random.Generator | None):
+        session.write_bytes(raw)
+        with suppress(
+            OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError
+        ):  # h5py refuses to write it.
+            if rng:
+                mutate_structure(session, rng)
+        return ["check", str(session)], None
 
-        def of_finger(rng: np.random.Generator | None):
-            (folder / "finger.toml").write_text(mutated_text(finger, rng) if rng else finger)
-            return ["import", *logs, "--mapping", str(folder / "mapping.toml"), "-o", str(out)], out
+    def of_bytes(rng: np.random.Generator | None):
+        session.write_bytes(mutated_bytes(raw, rng) if rng else raw)
+        return ["check", str(session)], None
 
-        count("mappings", number, of_mapping)
-        finger = (folder / "finger.toml").read_text()
-        count("fingers", number // 4, of_finger)
-        cases = ROOT / "tests" / "data" / "cases"
-        as_newer_matlab(cases / "simulink-signal-of-two-columns", folder / "newer")
-        for kind, recording, mapped, mutate in (
-            ("CSV", cases / "csv-as-other-programs-write-it/quoted.csv", "quoted.toml", mutated_table),
-            ("CSV of Scope", cases / "csv-as-other-programs-write-it/scope.csv", "scope.toml", mutated_bytes),
-            ("MAT", cases / "simulink-signal-of-two-columns/log.mat", "m.toml", mutated_bytes),
-            ("MAT 7.3", folder / "newer/log.mat", "m.toml", mutated_bytes),
-            ("MCAP", cases / "one-message-at-time-zero/log.mcap", "m.toml", mutated_bytes),
-            ("bag", cases / "joint-states-of-two-publishers/log", "m.toml", mutated_bytes),
-        ):
-            target = folder / "mutated" / recording.name
-            shutil.rmtree(folder / "mutated", ignore_errors=True)
-            (folder / "mutated").mkdir()
-            if recording.is_dir():
-                shutil.copytree(recording, target, copy_function=shutil.copyfile)
-                target.chmod(0o755)
-            inner = next(target.glob("*.db3")) if recording.is_dir() else target
-            raw = (next(recording.glob("*.db3")) if recording.is_dir() else recording).read_bytes()
-            text = (recording.parent / mapped).read_text()
-            text = text.replace('time = "t"', 'time = "q.time"') if kind == "CSV of Scope" else text
-            text = text.replace("column = 0", 'column = "J"') if kind == "bag" else text
-            (folder / "case.toml").write_text(text)
-
-            def of_recording(rng: np.random.Generator | None, inner=inner, raw=raw, mutate=mutate, target=target):
-                inner.write_bytes(mutate(raw, rng) if rng else raw)
-                return ["import", str(target), "--mapping", str(folder / "case.toml"), "-o", str(out)], out
-
-            count(kind, number // 4, of_recording)
-        sound = folder / "sound.h5"
-        write_session(make_session(), sound)
-        raw = sound.read_bytes()
-        session = folder / "session.h5"
-
-        def of_structure(rng: np.random.Generator | None):
-            session.write_bytes(raw)
-            with suppress(
-                OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError
-            ):  # h5py refuses to write it.
-                if rng:
-                    mutate_structure(session, rng)
-            return ["check", str(session)], None
-
-        def of_bytes(rng: np.random.Generator | None):
-            session.write_bytes(mutated_bytes(raw, rng) if rng else raw)
-            return ["check", str(session)], None
-
-        count("structure of a session", number // 2, of_structure)
-        count("bytes of a session", number * 5, of_bytes)
+    count("structure of a session", number // 2, of_structure)
+    count("bytes of a session", number * 5, of_bytes)
 
 
 def main() -> None:
