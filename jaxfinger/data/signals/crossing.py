@@ -57,6 +57,8 @@ def _crossings(trial: Trial, pace: float) -> list[float]:
         q, qd, qdd = smooth(time, angle, cutoff)
         friction, smoothed = (low_pass(time, x, cutoff) for x in (np.sign(qd), torque))
         laws = np.column_stack([np.ones_like(q), q, friction, qd, qdd])
+        if not (np.isfinite(laws).all() and np.isfinite(smoothed).all()):
+            continue  # damaged times or values, whose rates or sums overflow
         size = np.maximum(np.abs(laws).max(axis=0), 1e-300)  # for rounding, in whatever units
         inertia = abs(np.linalg.lstsq(laws / size, smoothed, rcond=None)[0] / size)[-1]
         of_angle, of_torque = (_noise(time, x, NOISE_RATIO * cutoff) for x in (angle, torque))

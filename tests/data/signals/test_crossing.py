@@ -38,3 +38,8 @@ def test_units_and_pace_do_not_change_what_is_above_it():
 def test_without_noise_or_without_sweeps_it_is_unknown():
     assert crossing_of(sweeps(1e-3, 0.0, 0.0), 1.0) == np.inf
     assert crossing_of(Session("a finger", FINGER, {}), 1.0) == np.inf
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, that numbers overflow
+def test_a_damaged_clock_whose_rates_overflow_tells_nothing():
+    assert crossing_of(sweeps(1e-3, 2e-4, 3e-4, pace=1e-200), 1e-200) == np.inf
