@@ -78,7 +78,9 @@ class _Source(eqx.Module):
     basis: Float[Array, "k c"]  # their part of the basis of `resample`
     coordinates: Int[Array, " c"]  # numbers of the coordinates of `resample` that move any of them
 
-    def rows(self, model: Model, flat: Float[Array, " P"], limit: float | Float[Array, ""]) -> Float[Array, " r"]:
+    def rows(
+        self, model: Model, flat: Float[Array, " P"], limit: float | Float[Array, ""]
+    ) -> Float[Array | np.ndarray, " r"]:
         """White residuals under Huber's cost."""
         at = self.free.set(model, flat[self.columns])
         return robust_residuals(white_rows(at, self.batch, self.filters)[1].ravel()[self.counts], limit)

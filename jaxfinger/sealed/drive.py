@@ -176,7 +176,7 @@ def simulate(finger: Finger, nominal: Finger, plans: Sequence[Plan]) -> list[Run
     for i in range(len(fine) * CONTROL):
         if i % CONTROL == 0:
             k = i // CONTROL
-            command = np.stack([c(k, *motion, *gains) for c, *motion in zip(controllers, q, qd, strict=True)])
+            command = np.stack([c(k, q[b], qd[b], *gains) for b, c in enumerate(controllers)])
             # The commanded tension wanders by 0.4 % and 0.02 N about that.
             command = command * (1 + 0.004 * noises[:, k]) + 0.02 * noises[:, k] * (command > 0)
         f = f + (command - f) * (STEP / LAG)
