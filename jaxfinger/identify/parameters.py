@@ -212,23 +212,8 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
             return Parameter(f"{field} {index}", field, units)
         case ["moment_arm", _]:
             return _moment_arm(model, *index)
-        case ["joint_torque", "damping"]:
-            units = "N s/m" if model.finger.prismatic[index[0]] else "N m s/rad"
-            return Parameter(f"damping {joints[index[0]]}", "damping", units, joints[index[0]])
-        case ["joint_torque", "torque_friction"]:
-            label = f"friction of its own torque {joints[index[0]]}"
-            return Parameter(label, "torque_friction", "1", joints[index[0]])
-        case ["joint_torque", ("friction_by_direction" | "damping_by_direction") as field]:
-            units, viscous = ("N" if model.finger.prismatic[index[0]] else "N m"), field.startswith("damping")
-            if viscous:
-                units = "N s/m" if model.finger.prismatic[index[0]] else "N m s/rad"
-            label = f"{'damping' if viscous else 'friction torque'} by direction {joints[index[0]]}"
-            return Parameter(label, "friction_by_direction", units, joints[index[0]])
         case ["joint_torque", field]:
-            joint, power = joints[index[0]], index[1]
-            slides = model.finger.prismatic[index[0]]
-            units = _per_rad("N", power).replace("rad", "m") if slides else _per_rad("N m", power)
-            return Parameter(f"{field} torque {joint}^{power}", field, units, joint, power=power)
+            return _joint_torque(model, field, *index)
         case ["tendon_friction", field]:
             tendon = tendons[index[0]]
             active = model.finger.active[index[0]]
@@ -250,6 +235,24 @@ def _describe(model: Model, keys: list, index: tuple[int, ...]) -> Parameter:
                 return Parameter(f"{label} {index}" if index else label, "constant", "", determinable=False)
             return Parameter(label, "effects", units[field], term=field)
     raise AssertionError(keys)
+
+
+def _joint_torque(model: Model, field: str, i: int, power: int = 0) -> Parameter:
+    joint, slides = model.finger.joint_names[i], model.finger.prismatic[i]
+    torque, viscous = ("N", "N s/m") if slides else ("N m", "N m s/rad")
+    match field:
+        case "damping":
+            return Parameter(f"damping {joint}", field, viscous, joint)
+        case "torque_friction":
+            return Parameter(f"friction of its own torque {joint}", field, "1", joint)
+        case "friction_by_direction":
+            return Parameter(f"friction torque by direction {joint}", field, torque, joint)
+        case "damping_by_direction":
+            return Parameter(f"damping by direction {joint}", "friction_by_direction", viscous, joint)
+    units = _per_rad(torque, power)
+    return Parameter(
+        f"{field} torque {joint}^{power}", field, units.replace("rad", "m") if slides else units, joint, power=power
+    )
 
 
 def _moment_arm(model: Model, k: int, t: int) -> Parameter:
