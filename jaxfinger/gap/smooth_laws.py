@@ -20,7 +20,7 @@ from jaxfinger.model import Finger
 MIN_ROWS = 50  # rows. A column has some forty features, which would fit the noise of fewer rows.
 # Nearly collinear features differ in a few samples only. A direction with a smaller singular value, relative to the
 # largest, would therefore fit single samples.
-MIN_RELATIVE_SINGULAR_VALUE = 0.1
+MIN_DISTINCT_SINGULAR_VALUE = 0.1
 SMOOTHING = 15  # samples. Averages of so many have a quarter of the noise, which would add reversals of its own.
 MIN_REVERSAL = 0.02  # share of a signal's range. A way back that is shorter is noise, or no change of direction.
 
@@ -134,7 +134,7 @@ def orthonormal_basis(features: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "
     """Orthonormal basis of the span of normalised features, without directions that only near copies differ in."""
     A = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-300)
     U, s, _ = np.linalg.svd(A.T, full_matrices=False)
-    return U[:, s > MIN_RELATIVE_SINGULAR_VALUE * s[0]]
+    return U[:, s > MIN_DISTINCT_SINGULAR_VALUE * s[0]]
 
 
 def smooth_parts(problem: Problem, residual: Float[np.ndarray, " N"]) -> list[SmoothPart]:

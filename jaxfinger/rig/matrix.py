@@ -27,8 +27,8 @@ PHASES = ("arming", "ramp", "hold", "letting go")
 # s allowed from where a fault shows to the stop. The slowest way is the controller's heartbeat watchdog, 0.25 s, and
 # one period of the watch.
 STOP_S = 0.3
-RELEASE_S = 0.7  # s from the stop to no tension: the controller ramps to 2 N in 0.2 s and to 0.5 N in 0.5 s
-OFF_S = STOP_S + RELEASE_S
+LETTING_GO_S = 0.7  # s from the stop to no tension: the controller ramps to 2 N in 0.2 s and to 0.5 N in 0.5 s
+OFF_S = STOP_S + LETTING_GO_S
 LOST_S = 0.2  # s of samples before the fault that may be missing from the file
 END_S = 10.0  # s from the fault until `record` has ended by itself
 
@@ -185,7 +185,7 @@ def stream(rig: RigDescription, phase: str) -> Block:
         "ramp": (np.full(LENGTH, State.MOVING), 3.0 + 5.0 * k / rig.rate_hz),
         "hold": (np.full(LENGTH, State.ARMED), np.full(LENGTH, 8.0)),
         "letting go": (
-            np.where(seconds < RELEASE_S, np.where(k < BEGIN - 50, State.ARMED, State.RELEASING), State.IDLE),
+            np.where(seconds < LETTING_GO_S, np.where(k < BEGIN - 50, State.ARMED, State.RELEASING), State.IDLE),
             np.maximum(8.0 - 30.0 * np.maximum(k - BEGIN + 50, 0) / rig.rate_hz, 0.0),
         ),
     }[phase]
@@ -258,7 +258,7 @@ def table(rig: RigDescription, results: Results) -> str:
     ]
     for row in MATRIX:
         stop = stopped_s(rig, row, results)
-        off = f"{stop + (0.0 if row.at_once else RELEASE_S):.2f} s" if row.off else "the drives' own watchdog"
+        off = f"{stop + (0.0 if row.at_once else LETTING_GO_S):.2f} s" if row.off else "the drives' own watchdog"
         shows = f"{row.shows(rig):g} s" if row.shows(rig) else "at once"
         lines.append(f"| {row.says} | {shows} | {stop:.2f} s | {off} | {row.by} |")
     return "\n".join(lines) + "\n"

@@ -24,7 +24,7 @@ EPOCH_NS = 946_684_800 * 10**9  # Unix time of 2000-01-01, ns: zero of the contr
 # Blocks that may wait for the runner: 150 s at one every 50 ms (poll_s). Limits memory; recorder and supervisor have
 # had the blocks that are dropped.
 MAX_WAITING_BLOCKS = 3000
-JOIN_S = 1.0  # s that closing waits for a reader that hangs in a call; the thread is then left behind
+JOIN_S = 1.0  # s that closing waits for a thread; one that hangs in a call is then left behind
 
 
 class Reader:

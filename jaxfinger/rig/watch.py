@@ -24,7 +24,7 @@ from jaxfinger.errors import UserError
 from jaxfinger.rig.backend import Rig
 from jaxfinger.rig.contract import Trip
 from jaxfinger.rig.operator import Operator
-from jaxfinger.rig.reader import Reader
+from jaxfinger.rig.reader import JOIN_S, Reader
 from jaxfinger.rig.safety import Violation
 from jaxfinger.rig.signals import INTERRUPTED, Interrupts
 
@@ -35,7 +35,6 @@ BEAT_S = 0.05
 # s, the most that one check adds to a thread's silence. If the watch itself ran late, the machine was busy, and the
 # other threads may have been late for the same reason.
 MAX_COUNTED_S = 0.1
-JOIN_S = 1.0  # s that closing waits for each thread; one that hangs is then left behind
 
 
 class Watch:
