@@ -1,5 +1,6 @@
 """Errors of the sensors: gains, offsets, drift, rotation, delay."""
 
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -156,7 +157,11 @@ DELAYED_CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fi
 
 
 class ChannelDelay(CatalogueEffect):
-    """y(t − delay): one channel lags the others (first order). In trials with held joints it shows nothing."""
+    """y(t − delay): one channel lags the others. In trials with held joints it shows nothing.
+
+    The recording is read as much later. To first order, y + delay ẏ, the channel's noise would grow with the delay, and
+    a fit would prefer too short a one.
+    """
 
     ID: ClassVar = "channel_delay"
     PLACE: ClassVar = "channel"
@@ -183,19 +188,40 @@ class ChannelDelay(CatalogueEffect):
             return x
         d_q, d_f = self._of("q"), self._of("tendon_force")
         return eqx.tree_at(
-            lambda x: (x.q, x.qd, x.tension),
+            lambda x: (x.q, x.qd, x.qdd, x.tension),
             x,
-            (x.q + d_q * x.qd, x.qd + d_q * x.qdd, x.tension + d_f * rate(x.tension, x.time)),
+            (*(read_later(a, x.time, d_q) for a in (x.q, x.qd, x.qdd)), read_later(x.tension, x.time, d_f)),
         )
 
     def reading(self, channel, x, y):
         if x.held:
             return y
+        late = read_later(y, x.time, -self._of(channel))
         if channel == "joint_torque":
             # No sensor measures the free finger's external torque, which is zero by definition. A joint at rest has no
             # rate; the differences at the first and last sample of a hold would reach into the motion beside it.
-            return y - self._of(channel) * rate(y, x.time) * jnp.where(x.qd != 0.0, x.motorised, 0.0)
-        return y - self._of(channel) * rate(y, x.time)
+            return jnp.where((x.qd != 0.0) & (x.motorised > 0.0), late, y)
+        return late
+
+
+def read_later(y: Float[Array, "*T"], time: Float[Array, "*#T"], by: Float[Array, ""]) -> Float[Array, "*T"]:
+    """y(t + by), along the last axis: cubic Hermite interpolation between samples, with the slopes of `rate`.
+
+    Beyond the first and last sample y goes on with the slope there.
+    """
+    each = jnp.broadcast_to(by, y.shape[:-1])
+    return _interpolated(y, rate(y, time), jnp.broadcast_to(time, y.shape), each)
+
+
+@partial(jnp.vectorize, signature="(t),(t),(t),()->(t)")
+def _interpolated(y, slope, time, by):
+    inside = jnp.clip(time + by, time[0], time[-1])
+    i = jnp.clip(jnp.searchsorted(time, inside, side="right") - 1, 0, time.size - 2)
+    h = time[i + 1] - time[i]
+    u = jnp.where(h > 0.0, (inside - time[i]) / jnp.where(h > 0.0, h, 1.0), 0.0)
+    values = (1.0 + 2.0 * u) * (1.0 - u) ** 2 * y[i] + u**2 * (3.0 - 2.0 * u) * y[i + 1]
+    slopes = u * (1.0 - u) ** 2 * slope[i] - u**2 * (1.0 - u) * slope[i + 1]
+    return values + h * slopes + (time + by - inside) * jnp.where(by < 0.0, slope[0], slope[-1])
 
 
 def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
