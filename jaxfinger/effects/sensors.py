@@ -4,6 +4,7 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -88,7 +89,7 @@ class TensionSensorScale(CatalogueEffect):
 
 
 class _Encoder(CatalogueEffect):
-    """Base class of the errors of a joint's encoder: q = q_measured − error(q_measured)."""
+    """Base class of the errors of a joint's encoder: q = q_measured − error(q_measured), and its rates."""
 
     def error(self, q: Float[Array, "*T"]) -> Float[Array, "*T"]:
         """Error at the measured angle q, rad."""
@@ -96,7 +97,13 @@ class _Encoder(CatalogueEffect):
 
     def true_motion(self, x):
         i = self.index[0]
-        return eqx.tree_at(lambda x: x.q, x, x.q.at[i].add(-self.error(x.q[i])))
+
+        def motion(q, qd):
+            return jax.jvp(lambda q: q - self.error(q), (q,), (qd,))
+
+        (q, qd), (_, qdd) = jax.jvp(motion, (x.q[i], x.qd[i]), (x.qd[i], x.qdd[i]))
+        true = x.q.at[i].set(q), x.qd.at[i].set(qd), x.qdd.at[i].set(qdd)
+        return eqx.tree_at(lambda x: (x.q, x.qd, x.qdd), x, true)
 
 
 class EncoderOffset(_Encoder):

@@ -263,6 +263,18 @@ def test_a_delayed_angle_delays_its_speed_and_acceleration():
     np.testing.assert_array_equal(x.tension, X.tension)
 
 
+def test_an_eccentric_encoder_shows_other_speeds_and_accelerations_too():
+    """Of the true angle q − A sin q − B cos q, by its derivatives."""
+    A, B = 0.05, -0.03
+    effect = CATALOGUE["encoder_eccentricity"].at(FINGER, (FINGER.joint_names[1],), A=A, B=B)
+    x, (q, qd, qdd) = effect.true_motion(X), (np.asarray(a)[1] for a in (X.q, X.qd, X.qdd))
+    slope, bend = 1 - A * np.cos(q) + B * np.sin(q), A * np.sin(q) + B * np.cos(q)
+    np.testing.assert_allclose(x.q[1], q - A * np.sin(q) - B * np.cos(q), rtol=1e-12)
+    np.testing.assert_allclose(x.qd[1], slope * qd, rtol=1e-12)
+    np.testing.assert_allclose(x.qdd[1], slope * qdd + bend * qd**2, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(x.qd[0], X.qd[0])
+
+
 def test_rates_hold_up_to_the_cut_off_of_reduced_channels():
     """At 10 Hz and 50 samples a second they lose 2 %; differences of the second order would lose 24 %."""
     time = np.arange(60) / 50.0
