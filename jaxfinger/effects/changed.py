@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude
 from jaxfinger.effects.body import MAX_REMOVED_SHARE
-from jaxfinger.effects.drive import JointOffset
+from jaxfinger.effects.drive import JointFrictionAsymmetric, JointOffset, JointTorqueFriction
 from jaxfinger.effects.nominal import JointCoulomb, JointDamping, JointElastic, TendonFrictionTerm
 
 
@@ -60,6 +60,39 @@ class ChangedDamping(Changed, JointDamping):
     HAPPENS: ClassVar = "The joint's damping has changed since the fit was made."
 
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
+
+
+class ChangedFrictionByDirection(Changed, JointFrictionAsymmetric):
+    """coulomb + damping |q̇|: change of half the difference between a joint's friction forwards and back."""
+
+    ID: ClassVar = "changed_friction_by_direction"
+    GROUP: ClassVar = "friction_by_direction"
+    HAPPENS: ClassVar = "The joint's friction one way has changed since the fit was made, against that the other way."
+
+
+class ChangedTorqueFriction(Changed, JointTorqueFriction):
+    """μ |τ| s(q̇): change of the share of its torque that a joint's drive loses, of either sign."""
+
+    ID: ClassVar = "changed_torque_friction"
+    GROUP: ClassVar = "torque_friction"
+    HAPPENS: ClassVar = "The share of its torque that the joint's drive loses has changed since the fit was made."
+
+    mu: Float[Array, ""] = amplitude("1", 0.1, signed=True, most=0.95)
+
+
+class ChangedRotorInertia(Changed):
+    """inertia · q̈: change of a rotor's inertia, reflected to its joint, of either sign."""
+
+    ID: ClassVar = "changed_rotor_inertia"
+    GROUP: ClassVar = "rotor_inertia"
+    PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The inertia of the joint's rotor has changed since the fit was made."
+
+    inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length", signed=True)
+
+    def finger(self, finger):
+        i = self.index[0]
+        return eqx.tree_at(lambda f: f.rotor_inertia, finger, finger.rotor_inertia.at[i, i].add(self.inertia))
 
 
 class ChangedTendonFriction(Changed, TendonFrictionTerm):
