@@ -20,6 +20,7 @@ class Changed(CatalogueEffect):
     """Base class: the amplitudes are changes of the nominal parameters of `GROUP` at the site, in their order."""
 
     GROUP: ClassVar[str]
+    FIRST: ClassVar[int] = 0  # position among these of the parameter that the first amplitude changes
     LOOKS: ClassVar = "Every trial that depends on it is off in the same way; no trial from before the change is."
     CHANGE: ClassVar = "Find out what was changed on the finger since, or identify it again."
 
@@ -50,6 +51,22 @@ class ChangedFriction(Changed, JointCoulomb):
     HAPPENS: ClassVar = "The joint's dry friction has changed since the fit was made."
 
     c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
+
+
+class ChangedFrictionLevel(Changed):
+    """s(q̇) c₀: change of a joint's Coulomb friction by the same amount at every angle, of either sign."""
+
+    ID: ClassVar = "changed_friction_level"
+    GROUP: ClassVar = "friction"
+    PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = (
+        "The joint's dry friction has changed since the fit was made, by the same amount at every angle."
+    )
+
+    c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
+
+    def joint_friction(self, x, f_j, C, F):
+        return F.at[self.index[0]].add(self.c0)
 
 
 class ChangedDamping(Changed, JointDamping):
@@ -101,6 +118,22 @@ class ChangedTendonFriction(Changed, TendonFrictionTerm):
     ID: ClassVar = "changed_tendon_friction"
     GROUP: ClassVar = "tendon_friction"
     HAPPENS: ClassVar = "The friction of the tendon's path has changed since the fit was made."
+
+
+class ChangedTendonShare(Changed):
+    """a₁ f: change of the share of its tension that a tendon loses on its path."""
+
+    ID: ClassVar = "changed_tendon_share"
+    GROUP: ClassVar = "tendon_friction"
+    FIRST: ClassVar = 1  # behind a₀
+    PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The share of its tension that the tendon loses has changed since the fit was made."
+
+    a1: Float[Array, ""] = amplitude("1", 0.3, signed=True)
+
+    def loss(self, x, f, C, loss):
+        k = self.index[0]
+        return loss.at[k].add(self.a1 * f[k])
 
 
 class ChangedMomentArm(Changed):

@@ -297,7 +297,7 @@ def changed_parameters(against: Fit, found: Posterior, fit: Fit) -> tuple[Change
 def altered_by(effect: Changed, parameters: Sequence[Parameter]) -> list[int]:
     """Positions of the nominal parameters that a change alters, in the order of its amplitudes."""
     mine = [i for i, p in enumerate(parameters) if p.group == effect.GROUP and p.determinable]
-    return [i for i in mine if {parameters[i].joint, parameters[i].tendon} - {None} == set(effect.site)]
+    return [i for i in mine if {parameters[i].joint, parameters[i].tendon} - {None} == set(effect.site)][effect.FIRST :]
 
 
 def retuned_parameters(problem: Problem, fit: Fit) -> tuple[Change, ...]:

@@ -23,6 +23,13 @@ def test_every_term_of_a_recipe_may_have_changed():
     assert set(GROUP_OF_TERM.values()) <= {kind.GROUP for kind in CHANGED.values()}
 
 
+def test_a_law_of_one_constant_has_one_change():
+    """Two copies would share its probability."""
+    constants = changes(0, 0, 4)
+    of_one = [c for c in constants.values() if c.GROUP in ("elastic", "friction")]
+    assert {c.ID for c in of_one} == {"changed_pretension", "changed_friction_level"}
+
+
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("last", [False, True], ids=["first site", "last site"])
 def test_a_change_is_that_of_the_parameters_which_it_names(name, last):

@@ -49,6 +49,7 @@ def test_nothing_has_changed(earlier):
     ("truth", "group"),
     [
         (changed("changed_pretension", "PIP", tau=1e-3), "elastic"),
+        (changed("changed_friction_level", "PIP", c0=1e-3), "friction"),
         (changed("changed_mass", "DIP", m=1e-3), "mass"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
