@@ -168,7 +168,7 @@ def _print(folders: dict[Path, Path], texts: dict[str, str], found: dict[str, Di
         print(f"\n{folder / 'report.html'}: the evidence\n")
     if len(found) > 1:
         header, rows = comparison(found)
-        table("Probability of every cause, session by session, and its size", header, rows)
+        table("Causes that a session names: probability in every session, and size", header, rows)
 
 
 def refuse(output: Path, overwrite: bool, *reads: Path | None) -> None:

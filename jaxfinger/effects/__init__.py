@@ -40,11 +40,12 @@ def nominal_terms(elastic_degree: int, friction_degree: int) -> dict[str, type[C
 
 def changes(elastic_degree: int, friction_degree: int, moment_arm_degree: int) -> dict[str, type[CatalogueEffect]]:
     """Effects that stand for changes of nominal parameters since an earlier fit, by id, as polynomials of the given
-    degrees.
+    degrees. One of degree zero has no copy beside the effect that changes the constant alone.
     """
     degrees = {"changed_elastic": elastic_degree, "changed_friction": friction_degree}
+    copies = {n for n, degree in degrees.items() if degree == 0}
     degrees["changed_moment_arm"] = moment_arm_degree - 1
-    return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in CHANGED.items()}
+    return {n: nominal.of_degree(c, degrees[n]) if n in degrees else c for n, c in CHANGED.items() if n not in copies}
 
 
 # A user's own effects: the Python file that defines them, or their classes by id.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude
 from jaxfinger.effects.body import MAX_REMOVED_SHARE
-from jaxfinger.effects.drive import JointOffset
+from jaxfinger.effects.drive import JointFrictionAsymmetric, JointOffset, JointTorqueFriction
 from jaxfinger.effects.nominal import JointCoulomb, JointDamping, JointElastic, TendonFrictionTerm
 
 
@@ -20,6 +20,7 @@ class Changed(CatalogueEffect):
     """Base class: the amplitudes are changes of the nominal parameters of `GROUP` at the site, in their order."""
 
     GROUP: ClassVar[str]
+    FIRST: ClassVar[int] = 0  # position among these of the parameter that the first amplitude changes
     LOOKS: ClassVar = "Every trial that depends on it is off in the same way; no trial from before the change is."
     CHANGE: ClassVar = "Find out what was changed on the finger since, or identify it again."
 
@@ -52,6 +53,22 @@ class ChangedFriction(Changed, JointCoulomb):
     c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
 
 
+class ChangedFrictionLevel(Changed):
+    """s(q̇) c₀: change of a joint's Coulomb friction by the same amount at every angle, of either sign."""
+
+    ID: ClassVar = "changed_friction_level"
+    GROUP: ClassVar = "friction"
+    PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = (
+        "The joint's dry friction has changed since the fit was made, by the same amount at every angle."
+    )
+
+    c0: Float[Array, ""] = amplitude("N m", 0.1, "torque", signed=True)
+
+    def joint_friction(self, x, f_j, C, F):
+        return F.at[self.index[0]].add(self.c0)
+
+
 class ChangedDamping(Changed, JointDamping):
     """d q̇: change of a joint's damping, of either sign."""
 
@@ -62,12 +79,61 @@ class ChangedDamping(Changed, JointDamping):
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
 
 
+class ChangedFrictionByDirection(Changed, JointFrictionAsymmetric):
+    """coulomb + damping |q̇|: change of half the difference between a joint's friction forwards and back."""
+
+    ID: ClassVar = "changed_friction_by_direction"
+    GROUP: ClassVar = "friction_by_direction"
+    HAPPENS: ClassVar = "The joint's friction one way has changed since the fit was made, against that the other way."
+
+
+class ChangedTorqueFriction(Changed, JointTorqueFriction):
+    """μ |τ| s(q̇): change of the share of its torque that a joint's drive loses, of either sign."""
+
+    ID: ClassVar = "changed_torque_friction"
+    GROUP: ClassVar = "torque_friction"
+    HAPPENS: ClassVar = "The share of its torque that the joint's drive loses has changed since the fit was made."
+
+    mu: Float[Array, ""] = amplitude("1", 0.1, signed=True, most=0.95)
+
+
+class ChangedRotorInertia(Changed):
+    """inertia · q̈: change of a rotor's inertia, reflected to its joint, of either sign."""
+
+    ID: ClassVar = "changed_rotor_inertia"
+    GROUP: ClassVar = "rotor_inertia"
+    PLACE: ClassVar = "joint"
+    HAPPENS: ClassVar = "The inertia of the joint's rotor has changed since the fit was made."
+
+    inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length", signed=True)
+
+    def finger(self, finger):
+        i = self.index[0]
+        return eqx.tree_at(lambda f: f.rotor_inertia, finger, finger.rotor_inertia.at[i, i].add(self.inertia))
+
+
 class ChangedTendonFriction(Changed, TendonFrictionTerm):
     """a₀ + a₁ f: change of the affine friction of a tendon's path."""
 
     ID: ClassVar = "changed_tendon_friction"
     GROUP: ClassVar = "tendon_friction"
     HAPPENS: ClassVar = "The friction of the tendon's path has changed since the fit was made."
+
+
+class ChangedTendonShare(Changed):
+    """a₁ f: change of the share of its tension that a tendon loses on its path."""
+
+    ID: ClassVar = "changed_tendon_share"
+    GROUP: ClassVar = "tendon_friction"
+    FIRST: ClassVar = 1  # behind a₀
+    PLACE: ClassVar = "tendon"
+    HAPPENS: ClassVar = "The share of its tension that the tendon loses has changed since the fit was made."
+
+    a1: Float[Array, ""] = amplitude("1", 0.3, signed=True)
+
+    def loss(self, x, f, C, loss):
+        k = self.index[0]
+        return loss.at[k].add(self.a1 * f[k])
 
 
 class ChangedMomentArm(Changed):

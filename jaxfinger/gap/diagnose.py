@@ -269,9 +269,8 @@ def candidate_effects(
     without: tuple[str, ...],
 ) -> dict[str, type[CatalogueEffect]]:
     """Effects of the catalogue that the nominal model lacks; `changed` are changes of an earlier fit's parameters."""
-    nominal = problem.fit.recipe.model
-    excluded = set(nominal.terms) | set(without)
-    if nominal.elastic_degree == 0:  # A constant elastic torque is no spring.
+    excluded = set(problem.fit.recipe.model.terms) | set(without)
+    if problem.nominal.joint_torque.elastic.shape[1] == 1:  # A constant elastic torque is no spring.
         excluded |= {k for k, c in catalogue.items() if c.OF_SPRING}
     laws = {law for c in changed.values() for law in c.__mro__}  # An effect that a change inherits from is its copy.
     return {k: c for k, c in catalogue.items() if k not in excluded and (k in changed or c not in laws)}

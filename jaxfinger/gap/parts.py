@@ -39,7 +39,7 @@ from jaxfinger.gap.sets import Alone, Search
 from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.smooth_laws import SmoothPart
 from jaxfinger.identify import Fit
-from jaxfinger.identify.parameters import describe, effect_parameter, ravel, units_at
+from jaxfinger.identify.parameters import Parameter, describe, effect_parameter, ravel, units_at
 from jaxfinger.identify.stages import Progress
 
 # The thresholds of this module decide what a report mentions, and no verdict.
@@ -283,15 +283,19 @@ def changed_parameters(against: Fit, found: Posterior, fit: Fit) -> tuple[Change
     for effect in fit.model.effects:
         if not isinstance(effect, Changed):
             continue
-        mine = [i for i, p in enumerate(parameters) if p.group == effect.GROUP]
-        mine = [i for i in mine if {parameters[i].joint, parameters[i].tendon} - {None} == set(effect.site)]
-        for i, name in zip(mine, effect.amplitudes(), strict=False):
+        for i, name in zip(altered_by(effect, parameters), effect.amplitudes(), strict=False):
             pair = [i, at[effect_parameter(effect, name)]]
             std = float(np.sqrt(max(fit.covariance[np.ix_(pair, pair)].sum(), 0.0)))
             p, probability = parameters[i], found.causes[effect.ID, effect.site]
             after = float(new[pair].sum())
             out.append(Change(p.name, p.group, p.units, float(old[i]), float(against.std[i]), after, std, probability))
     return tuple(out)
+
+
+def altered_by(effect: Changed, parameters: Sequence[Parameter]) -> list[int]:
+    """Positions of the nominal parameters that a change alters, in the order of its amplitudes."""
+    mine = [i for i, p in enumerate(parameters) if p.group == effect.GROUP and p.determinable]
+    return [i for i in mine if {parameters[i].joint, parameters[i].tendon} - {None} == set(effect.site)][effect.FIRST :]
 
 
 def retuned_parameters(problem: Problem, fit: Fit) -> tuple[Change, ...]:

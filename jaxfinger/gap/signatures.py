@@ -72,11 +72,12 @@ def catalogue_for(
 
 def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
     """Effects «changed since an earlier fit», by id, for the groups of parameters that the fit gives an uncertainty."""
-    r, parameters = fit.recipe.model, describe(fit.model)
+    torque, parameters = fit.model.joint_torque, describe(fit.model)
+    degrees = torque.elastic.shape[1] - 1, torque.friction.shape[1] - 1, fit.recipe.model.moment_arm_degree
     known = {p.group for p, s in zip(parameters, fit.std, strict=True) if 0.0 < s < np.inf}
     return {
         name: change
-        for name, change in changes(r.elastic_degree, r.friction_degree, r.moment_arm_degree).items()
+        for name, change in changes(*degrees).items()
         if issubclass(change, Changed) and change.GROUP in known
     }
 

@@ -99,13 +99,21 @@ def name_invisible(
         sentences.append(f"the trials do not show {names}; record {_remedy(parameters, free[alone])}")
     for v in _apart(np.where(alone, 0.0, invisible)):
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
-        combinations.setdefault(_remedy(parameters, _involved(free, v)), []).append(names)
-    for remedy, names in combinations.items():
+        combinations.setdefault(_mend(parameters, _involved(free, v)), []).append(names)
+    for mend, names in combinations.items():
         sentences.append(
             f"the trials cannot see the combination{'s' * (len(names) > 1)} {', '.join(names)} "
-            f"(in units of each parameter's own column); record {remedy}"
+            f"(in units of each parameter's own column); {mend}"
         )
     return sentences
+
+
+def _mend(parameters: list[Parameter], positions: Int[np.ndarray, " k"]) -> str:
+    """What to do about parameters that trade off. A finger without tendons has no ID.4 that could tell them apart."""
+    remedy = _remedy(parameters, positions)
+    if "ID.4" in remedy and not any(p.tendon for p in parameters):
+        return "leave one of them out of the recipe, since only ID.4 tells them apart, which needs a tendon to pull"
+    return f"record {remedy}"
 
 
 def _apart(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "r p"]:

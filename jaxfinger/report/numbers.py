@@ -152,5 +152,6 @@ def chance(probability: float) -> str:
 
 
 def percent_range(low: float, high: float) -> str:
-    """An interval of shares: «35 to 47 %»."""
-    return f"{round(100 * low)} to {round(100 * high)} %"
+    """An interval of shares: «35 to 47 %», and one number where both ends round to it: «over 99 %»."""
+    whole = round(100 * low), round(100 * high)
+    return percent(low) if whole[0] == whole[1] else f"{whole[0]} to {whole[1]} %"

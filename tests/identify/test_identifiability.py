@@ -43,6 +43,18 @@ def test_parameters_that_no_trial_touches_are_named_together_and_not_as_combinat
     assert "centre of mass MCP x" in traded
 
 
+@pytest.mark.parametrize("tendons", [True, False])
+def test_no_trial_is_asked_for_that_pulls_a_tendon_where_there_is_none(tendons):
+    parameters = [
+        Parameter("elastic torque MCP^0", "elastic", "N m", "MCP"),
+        Parameter("friction torque by direction MCP", "friction_by_direction", "N m", "MCP"),
+        *([Parameter("tendon friction T1 a0", "tendon_friction", "N", tendon="T1")] if tendons else []),
+    ]
+    (said,) = name_invisible(parameters, np.arange(2), np.array([[1.0, -1.0]]) / np.sqrt(2))
+    assert ("and ID.4 with the joint held" in said) is tendons
+    assert ("leave one of them out of the recipe" in said) is not tendons
+
+
 def test_laws_of_different_joints_are_not_mixed_into_one_combination():
     """Joints that turn one way only: each one's friction is its elastic torque. Any basis of that space may come."""
     joints = ("MCP", "PIP", "DIP")

@@ -102,3 +102,6 @@ def test_no_probability_is_certain(probability, text):
 def test_an_interval_about_nothing_has_no_minus_zero():
     assert percent_range(-3e-3, 0.02) == "0 to 2 %"
     assert percent_range(-0.37, 0.0) == "-37 to 0 %"
+    assert percent_range(0.996, 0.9999) == "over 99 %"
+    assert percent_range(0.498, 0.502) == "50 %"
+    assert percent_range(0.0, 0.0) == "0 %"

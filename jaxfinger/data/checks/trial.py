@@ -63,8 +63,8 @@ def _attributes(trial: Trial, finger: FingerDescription, report: Report) -> None
 
 
 def _several_joints(trial: Trial, finger: FingerDescription) -> bool:
-    """Whether the trial moves, or measures the torque of, more than one joint."""
-    if trial.experiment == "ID.2":
+    """Whether the trial measures the torque of more than one joint, or, where it measures none, moves more than one."""
+    if trial.experiment == "ID.2" or trial.joint_torque is None:
         return sum(bool(span >= still) for span, still in zip(_spans(trial), still_spans(finger), strict=True)) > 1
     return len(trial.motorised(finger)) > 1
 

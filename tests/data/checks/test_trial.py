@@ -22,3 +22,15 @@ def test_an_angle_against_the_base_is_said(session, experiment):
     # A fixture that yields, or joints that are coupled by another ratio, are no such angles.
     yielding = {t.name: summed(t, t.q + 0.5 * t.q[:, :1] * [0.0, 1.0]) for t in session}
     assert not any(words in text for text in complaints(replace(session, trials=yielding)))
+
+
+def test_where_several_joints_move_and_the_torque_is_missing_no_joint_is_asked_for(session):
+    """The trial needs its torque; naming one of the joints would hide that of the others."""
+    name = "08-ID.3-dynamic"
+    moved = replace(session.trials[name], joint_torque=None)
+    said = [text for text in complaints(replace(session, trials={**session.trials, name: moved})) if name in text]
+    assert any("is missing, and it is what ID.3-dynamic measures" in text for text in said)
+    assert not any("has no attribute `joint`" in text for text in said)
+    still = replace(moved, q=0.0 * moved.q + 0.1)
+    said = complaints(replace(session, trials={**session.trials, name: still}))
+    assert any(name in text and "has no attribute `joint`" in text for text in said)
