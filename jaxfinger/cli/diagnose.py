@@ -168,7 +168,8 @@ def _print(folders: dict[Path, Path], texts: dict[str, str], found: dict[str, Di
         print(f"\n{folder / 'report.html'}: the evidence\n")
     if len(found) > 1:
         header, rows = comparison(found)
-        table("Causes that a session names: probability in every session, and size", header, rows)
+        title = "Causes that a session names, or cannot tell apart: probability in every session, and size"
+        table(title, header, rows)
 
 
 def refuse(output: Path, overwrite: bool, *reads: Path | None) -> None:

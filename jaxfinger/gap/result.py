@@ -300,6 +300,11 @@ class Diagnosis:
     # Sentences on another simulator's predictions and the trials that they lack, or on an earlier fit.
     doubts: tuple[str, ...] = ()
 
+    @property
+    def blamed(self) -> set[Key]:
+        """Causes that the verdict names, and all members of the sets that it cannot tell apart."""
+        return set(self.named).union(*self.ambiguous_sets)
+
     def __repr__(self) -> str:
         named = ", ".join(f"{k.effect} at {'-'.join(k.site)}" for k in self.named) or "nothing named"
         return f"Diagnosis({self.data!r}: {self.status}; {named})"

@@ -69,11 +69,10 @@ def render(d: Diagnosis, trace: Trace | None = None, found: Curves | None = None
     environment.filters["code"] = _code
     template = environment.get_template("page.html.j2")
     prismatic = d.nominal.model.finger.prismatic
-    named = set(d.named).union(*d.ambiguous_sets)
     simulator = sentences.is_simulator(d)
     change = sentences.contradicted if simulator else sentences.change
     judged = d.candidates if d.status is not Status.NOT_JUDGED else ()
-    others = [c for c in judged if c.key not in named and c.probability >= MIN_PROBABILITY]
+    others = [c for c in judged if c.key not in d.blamed and c.probability >= MIN_PROBABILITY]
     return template.render(
         d=d,
         css=css(),

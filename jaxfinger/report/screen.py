@@ -45,19 +45,20 @@ def summary(d: Diagnosis, own: Iterable[str] = ()) -> str:
 def comparison(diagnoses: Mapping[str, Diagnosis]) -> tuple[list[str], list[list[str]]]:
     """Header and rows of a table of causes (rows) in several sessions (columns).
 
-    It holds every cause that some session names: its probability in each session, and its first parameter where named.
+    It holds every cause that some session names or cannot tell from others: its probability in each session, and its
+    first parameter where it is one of these.
     """
-    named = {key for d in diagnoses.values() for key in d.named}
-    rows = [[key_name(key), *(_in_session(key, d) for d in diagnoses.values())] for key in sorted(named)]
+    blamed = {key for d in diagnoses.values() for key in d.blamed}
+    rows = [[key_name(key), *(_in_session(key, d) for d in diagnoses.values())] for key in sorted(blamed)]
     return ["cause", *diagnoses], rows
 
 
 def _in_session(key: Key, d: Diagnosis) -> str:
-    """Probability of a cause in one session, and its first parameter where it is named there."""
+    """Probability of a cause in one session, and its first parameter where it is named there, or a rival."""
     found = next((c for c in d.candidates if c.key == key), None)
     if found is None:
         return "not visible"
-    sizes = [f", {v.name} {measured(v.value, v.std, v.units)}" for v in found.values[:1] if key in d.named]
+    sizes = [f", {v.name} {measured(v.value, v.std, v.units)}" for v in found.values[:1] if key in d.blamed]
     return chance(found.probability) + "".join(sizes)
 
 

@@ -49,8 +49,17 @@ def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
     )
     assert header == ["cause", "monday.h5", "tuesday.h5", "rest.h5"]
     said = {row[0]: row[1:] for row in rows}
-    assert set(said) == {"tendon stretch at T3", "joint Stribeck at PIP"}
+    assert set(said) == {"tendon stretch at T3", "tendon creep at T3", "joint Stribeck at PIP"}
     monday, tuesday, rest = said["tendon stretch at T3"]
     assert " %, compliance " in monday
-    assert tuesday == "50 %"  # not named there: no size
+    assert tuesday == "50 %, compliance 91.0 ± 5.9 µm/N"
     assert rest == "not visible"
+
+
+def test_the_table_of_several_sessions_has_every_rival_with_its_size_where_it_is_one():
+    _, rows = comparison({"a.h5": ALL["ambiguous"], "b.h5": ALL["no_gap"]})
+    size = "compliance 91.0 ± 5.9 µm/N"
+    assert rows == [
+        ["tendon creep at T3", f"36 %, {size}", "not visible"],
+        ["tendon stretch at T3", f"62 %, {size}", "2 %"],
+    ]
