@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxfinger.cli.output import plain, refuse_output
-from jaxfinger.errors import UserError, counted
+from jaxfinger.errors import UserError, counted, listed
 
 if TYPE_CHECKING:
+    from jaxfinger.data.importing.recording import Recording
     from jaxfinger.data.session import FingerDescription
+
+TENDONS = "T1, T2, T3, T4"  # in a template, or where recordings hold a tendon's columns
 
 
 def new(
@@ -42,7 +46,7 @@ def new(
     joints
         Names of the joints, base to tip, with commas between.
     tendons
-        Names of the tendons, with commas between; `none` for a finger without.
+        Names of the tendons, with commas between; `none` for a finger without, as for recordings of no tendon.
     robot
         A URDF or MJCF file to take the finger from: the named joints, by default all, and the tendons that cross them.
     tip
@@ -57,9 +61,11 @@ def new(
     if finger.resolve() == mapping.resolve():
         raise UserError(f"{finger}: is named twice; give one file for the finger, another for the mapping")
     from jaxfinger.data.atomic import atomic_path
+    from jaxfinger.data.importing.sources import load_recording
     from jaxfinger.data.importing.templates import finger_template, mapping_template
     from jaxfinger.data.importing.variables import UNKNOWN
 
+    loaded = [load_recording(path) for path in recordings]
     specimen = _asked("Name of the finger", specimen, "finger 1")
     if robot is not None:
         if tendons is not None:
@@ -75,12 +81,16 @@ def new(
         named = _names("joint", _asked("Joints, base to tip", joints, "MCP, PIP, DIP"))
         if not named:
             raise UserError("new: no joint is named; give --joints MCP,PIP,DIP, or so")
-        answer = _asked("Tendons, or none", tendons, "T1, T2, T3, T4")
+        seen = not loaded or _hold_tendons(loaded, named)
+        if tendons is None and not seen:
+            said = "no column is a tension or an excursion, so the finger has no tendons; if it has some, name them"
+            print(plain(f"{listed([path.name for path in recordings])}: {said}: --tendons {TENDONS.replace(' ', '')}"))
+        answer = _asked("Tendons, or none", tendons, TENDONS if seen else "none")
         all_tendons = [] if answer.strip() == "none" else _names("tendon", answer)
         described, pulled = finger_template(named, all_tendons), dict.fromkeys(all_tendons, named[-1])
     beside = _from(finger, mapping.parent)
-    if recordings:
-        mapped = _proposal(recordings, specimen, beside, described, finger)
+    if loaded:
+        mapped = _proposal(loaded, specimen, beside, described, finger)
     else:
         mapped = mapping_template(specimen, beside, named, pulled)
     for path, text in ((finger, described), (mapping, mapped)):
@@ -89,8 +99,8 @@ def new(
     count = f"{counted(len(named), 'joint')}, {counted(len(all_tendons), 'tendon')}"
     left = "replace its numbers by those of your finger" if robot is None else f"from {robot.name}"
     print(plain(f"{finger}: {count}; {left}"))
-    todo = "correct what was guessed" if recordings else "name your recordings and their columns"
-    if recordings and (unknown := mapped.count(f'"{UNKNOWN}"')):
+    todo = "correct what was guessed" if loaded else "name your recordings and their columns"
+    if loaded and (unknown := mapped.count(f'"{UNKNOWN}"')):
         todo = f'fill in {unknown} "{UNKNOWN}", {todo}'
     print(plain(f"{mapping}: {todo}, then: jaxfinger import … --mapping {mapping}"))
 
@@ -113,11 +123,19 @@ def _last_joints(finger: FingerDescription) -> dict[str, str]:
     return {name: finger.joint_names[max(crosses.nonzero()[0])] for name, active, crosses in rows if active}
 
 
-def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, described: str, finger: Path) -> str:
+def _hold_tendons(recordings: Sequence[Recording], joints: Sequence[str]) -> bool:
+    """Whether a column of some recordings is a tension or an excursion."""
+    from jaxfinger.data.importing.survey import columns_of
+
+    tendons = _names("tendon", TENDONS)
+    columns = (s for recording in recordings for s in columns_of(recording, recordings, joints, tendons))
+    return any(s.meaning in ("tendon_force", "tendon_excursion") for s in columns)
+
+
+def _proposal(recordings: Sequence[Recording], specimen: str, beside: str, described: str, finger: Path) -> str:
     """A mapping for the recordings, of the finger that the text `described` of the file `finger` describes."""
     from jaxfinger.data.finger_file import Finger, finger_from
     from jaxfinger.data.importing.proposal import proposal
-    from jaxfinger.data.importing.sources import load_recording
     from jaxfinger.data.importing.templates import COLUMNS
     from jaxfinger.data.toml import parse_toml, quoted, structure
 
@@ -125,7 +143,7 @@ def _proposal(recordings: tuple[Path, ...], specimen: str, beside: str, describe
     place = document.place / "finger"
     known = finger_from(structure(document.content["finger"], Finger, place), place)
     head = f"{COLUMNS}\nspecimen = {quoted(specimen)}\nfinger = {quoted(beside)}"
-    return proposal([load_recording(path) for path in recordings], known, head)
+    return proposal(recordings, known, head)
 
 
 def _asked(question: str, given: str | None, default: str) -> str:

@@ -125,6 +125,33 @@ def test_a_finger_may_lack_tendons(tmp_path):
     assert "tendons" not in (tmp_path / "f.toml").read_text()
 
 
+@pytest.mark.parametrize(
+    ("columns", "tendons"),
+    [
+        (("angle (deg)", "torque [N m]"), 0),  # an arm's, or a servo's
+        (("position", "current [A]"), 0),
+        (("angle (deg)", "T2 [N]"), 4),
+        (("angle (deg)", "cable travel [mm]"), 4),
+    ],
+)
+def test_recordings_of_no_tendon_are_of_a_finger_without(tmp_path, capsys, columns, tendons):
+    """Unless tendons are named, which is said."""
+    time = np.arange(600) / 50
+    table = np.column_stack([time, *(10 + k - 8 * np.cos(time + k) for k in range(len(columns)))])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(("time", *columns)), comments="")
+    asked = ["new", f"{tmp_path}/f.toml", f"{tmp_path}/m.toml", f"{tmp_path}/log.csv", "--joints", "J"]
+    main(asked)
+    told = capsys.readouterr().out
+    assert f"1 joint, {tendons} tendons" in told
+    assert (tmp_path / "f.toml").read_text().count("[[finger.tendons]]") == tendons
+    says = "log.csv: no column is a tension or an excursion, so the finger has no tendons; if it has some, name them"
+    assert (f"{says}: --tendons T1,T2,T3,T4" in told) == (not tendons)
+    main([*asked, "--tendons", "A,B", "--overwrite"])
+    told = capsys.readouterr().out
+    assert "1 joint, 2 tendons" in told
+    assert "no column" not in told
+
+
 def test_show_of_a_session_says_that_it_is_no_fit(tmp_path, capsys):
     (tmp_path / "session.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(SystemExit) as stopped:
