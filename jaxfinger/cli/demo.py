@@ -41,10 +41,9 @@ def demo(
         Replace files that are already there.
     """
     from jaxfinger.cli.diagnose import refuse
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
 
     refuse(output, overwrite)
-    make_folder(output)
     from jaxfinger.cli.tables import fit_to_read, print_fit
     from jaxfinger.data import read_session
     from jaxfinger.gap import diagnose
@@ -55,7 +54,7 @@ def demo(
     from jaxfinger.report.screen import summary
 
     print(BEFORE)
-    with progress("demo") as say:
+    with folder_to_fill(output), progress("demo") as say:
         say("reading the sessions")
         session, fresh = read_session(shipped("session.h5")), read_session(shipped("fresh.h5"))
         fit = identify(session, progress=say)

@@ -69,10 +69,10 @@ def diagnose(
         refuse(folder, overwrite, *sessions, against, predictions)
     if predictions is not None:
         _refuse_predictions(predictions, sessions)
-    tolerated = _tolerance(tolerance or [])
+    tolerated, left_out = _tolerance(tolerance or []), tuple(without or ())
     from dataclasses import replace
 
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
     from jaxfinger.effects import load
     from jaxfinger.gap import diagnose as run
     from jaxfinger.identify import load_fit, read_recipe
@@ -95,13 +95,13 @@ def diagnose(
         for session, folder in folders.items():
             name = session.name
             told = say if len(folders) == 1 else lambda message, name=name: say(f"{name}: {message}")
-            make_folder(folder)
-            d = run(measured[session], wanted, quick, own, tuple(without or ()), told, simulated, tolerated, earlier)
-            if against is not None:
-                d = replace(d, against=against.name)
-            told("writing the report")
-            write(d, folder, overwrite)
-            write_page(d, folder / "report.html", overwrite)
+            with folder_to_fill(folder):
+                d = run(measured[session], wanted, quick, own, left_out, told, simulated, tolerated, earlier)
+                if against is not None:
+                    d = replace(d, against=against.name)
+                told("writing the report")
+                write(d, folder, overwrite)
+                write_page(d, folder / "report.html", overwrite)
             texts[name], gaps[name] = summary(d, own), as_gap_json(d)
             found[name] = replace(d, problem=None)  # The problem holds every row of the session: its memory is freed.
     if json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -49,13 +50,11 @@ def identify(
         Replace files that are already there.
     """
     refuse_output(output, overwrite, file, recipe)
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
     from jaxfinger.identify import identify as run
     from jaxfinger.identify import read_recipe
 
-    if figures is not None:
-        make_folder(figures)
-    with progress("identify") as say:
+    with folder_to_fill(figures) if figures is not None else nullcontext(), progress("identify") as say:
         wanted = read_recipe(recipe)
         say("reading the file")
         session = read(file)
@@ -288,13 +287,11 @@ def validate(
         Replace figures that are already there.
     """
     from jaxfinger.cli.tables import print_validation
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
     from jaxfinger.identify import load_fit
     from jaxfinger.identify.validate import validate as run
 
-    if figures is not None:
-        make_folder(figures)
-    with progress("validate") as say:
+    with folder_to_fill(figures) if figures is not None else nullcontext(), progress("validate") as say:
         say("reading the files")
         loaded, session = load_fit(fit, effects), read(file)
         result = run(loaded, session, tuple(experiments) if experiments else None, say)

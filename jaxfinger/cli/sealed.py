@@ -47,15 +47,13 @@ def make(
         workers: processes; by default as many as there are cores.
         share: this machine's part of the work, for example 2/8.
     """
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
     from jaxfinger.sealed.cases import make_cases
 
     if count < 1:
         raise UserError(f"--count {count}: ask for at least one case")
     truth_root = truth or _beside(folder, "truth")
-    make_folder(folder)
-    make_folder(truth_root)
-    with _bar("making cases") as progress:
+    with folder_to_fill(folder), folder_to_fill(truth_root), _bar("making cases") as progress:
         make_cases(split, count, folder, truth_root, workers or os.cpu_count() or 1, _share(share), progress, mix=mix)
     print(f"{folder}: cases; {truth_root}: truth. Diagnose them with: jaxfinger sealed run {folder}")
 
@@ -185,7 +183,7 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
         truth: what `make` hid; by default FOLDER-truth, or truth.json beside each fit.h5.
         output: a folder for scores.json, table.md and reliability.svg.
     """
-    from jaxfinger.data.atomic import make_folder
+    from jaxfinger.data.atomic import folder_to_fill
     from jaxfinger.sealed.figures import reliability_diagram
     from jaxfinger.sealed.score import imitators, score_folder
     from jaxfinger.sealed.tables import markdown, render, render_imitators
@@ -203,11 +201,11 @@ def score(folder: Path, *, diagnoses: Path | None = None, truth: Path | None = N
     if stand_ins:
         console().print(render_imitators(stand_ins))
     if output:
-        make_folder(output)
         both = scores.to_json() | {"withheld": [asdict(r) for r in stand_ins]}
-        (output / "scores.json").write_text(json.dumps(both, indent=1))
-        (output / "table.md").write_text(markdown({folder.name: scores}))
-        reliability_diagram(scores.reliability, output / "reliability.svg")
+        with folder_to_fill(output):
+            (output / "scores.json").write_text(json.dumps(both, indent=1))
+            (output / "table.md").write_text(markdown({folder.name: scores}))
+            reliability_diagram(scores.reliability, output / "reliability.svg")
         print(f"{output}: scores.json, table.md, reliability.svg")
 
 

@@ -85,19 +85,29 @@ def _remove_orphans(folder: Path, prefix: str, suffix: str) -> None:
                     os.close(handle)
 
 
-def make_folder(path: str | os.PathLike) -> Path:
-    """Make the folder where there is none, and return its path.
+@contextmanager
+def folder_to_fill(path: str | os.PathLike) -> Iterator[Path]:
+    """Context of the path of a folder, which is made where there is none.
+
+    At the end, or where an error or Ctrl-C ends the work, the folders that it made and that are still empty are
+    removed.
 
     Raises:
         UserError: the path is a file, or the folder cannot be made.
     """
     path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        said = "is a file" if path.is_file() else f"cannot be made ({error.strerror})"
-        raise UserError(f"{path}: {said}; choose another folder") from None
-    return path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            said = "is a file" if os.path.isfile(path) else f"cannot be made ({error.strerror})"
+            raise UserError(f"{path}: {said}; choose another folder") from None
+        yield path
+    finally:
+        for folder in made:
+            with suppress(OSError):  # It is filled.
+                folder.rmdir()
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from jaxfinger.data.atomic import atomic_path, make_folder
+from jaxfinger.data.atomic import atomic_path, folder_to_fill
 from jaxfinger.effects import Site
 from jaxfinger.gap.result import Candidate, Cause, Diagnosis, Key, NextExperiment, Value
 from jaxfinger.identify.fit_file import save_fit
@@ -62,11 +62,11 @@ def write(d: Diagnosis, folder: str | Path, overwrite: bool = False) -> None:
     Raises:
         UserError: one of them exists and `overwrite` is false, or the folder cannot be written.
     """
-    folder = make_folder(folder)
-    with atomic_path(folder / "gap.json", overwrite) as part:
-        part.write_text(text(d), encoding="utf-8")
-    save_fit(d.nominal, folder / "nominal.json", overwrite)
-    save_fit(d.augmented, folder / "augmented.json", overwrite)
+    with folder_to_fill(folder) as folder:
+        with atomic_path(folder / "gap.json", overwrite) as part:
+            part.write_text(text(d), encoding="utf-8")
+        save_fit(d.nominal, folder / "nominal.json", overwrite)
+        save_fit(d.augmented, folder / "augmented.json", overwrite)
 
 
 def _cause(c: Cause) -> dict:

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jaxfinger.data import Session
-from jaxfinger.data.atomic import make_folder
+from jaxfinger.data.atomic import folder_to_fill
 from jaxfinger.identify import Fit
 from jaxfinger.report import plots
 from jaxfinger.report.curves import curves
@@ -23,7 +23,6 @@ def draw_identification(fit: Fit, session: Session, folder: str | Path, overwrit
     Raises:
         UserError: a figure exists and `overwrite` is false.
     """
-    folder = make_folder(folder)
     found = curves(fit, session)
     figures = {}
     if found.moment_arm:
@@ -35,7 +34,8 @@ def draw_identification(fit: Fit, session: Session, folder: str | Path, overwrit
         figure, ((ax,),) = grid(1, 1, 4.6, 3.2)
         plots.tendon_friction(found, ax)
         figures["tendon-friction"] = figure
-    return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
+    with folder_to_fill(folder) as folder:
+        return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
 
 
 def _panels(draw, found, joints: list[str]) -> Figure:

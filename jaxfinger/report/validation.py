@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxfinger.data import Session, Trial
-from jaxfinger.data.atomic import make_folder
+from jaxfinger.data.atomic import folder_to_fill
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Fit
@@ -28,7 +28,6 @@ def draw_validation(fit: Fit, session: Session, folder: str | Path, overwrite: b
     Raises:
         UserError: a figure exists and `overwrite` is false, or the session is of another finger.
     """
-    folder = make_folder(folder)
     model = model_for(fit, session)
     figures = {}
     if trials := list(session.select("VD.1")):
@@ -38,7 +37,8 @@ def draw_validation(fit: Fit, session: Session, folder: str | Path, overwrite: b
         figures["vd2"] = _vd2(model, session, prepare(session, names)["VD.2"])
     if trials := list(session.select("VD.3")):
         figures["vd3"] = _vd3(model, session, trials[0])
-    return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
+    with folder_to_fill(folder) as folder:
+        return [save(f, folder / f"{name}.svg", overwrite) for name, f in figures.items()]
 
 
 def _vd1(model: Model, session: Session, trial: Trial) -> Figure:

@@ -121,8 +121,6 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
         return folder
     seed = [SPLITS[split], number, *MIXES[mix]]
     case = _draw(seed, split, spec)
-    folder.mkdir(parents=True, exist_ok=True)
-    truth_root.mkdir(parents=True, exist_ok=True)
     specimen, sensors, rng = case.noise_free.specimen, case.noise_free.sensors, case.rng
     finger = Finger(specimen, case.departures)
     zero = rng.normal(0, 1e-4, finger.n)
@@ -132,6 +130,8 @@ def make_case(number: int, split: str, spec: CaseSpec, root: Path, truth_root: P
         p.seed: driven(r, p.rate)
         for p, r in zip(together, simulate(finger, case.noise_free.nominal, together), strict=True)
     }
+    folder.mkdir(parents=True, exist_ok=True)
+    truth_root.mkdir(parents=True, exist_ok=True)
     for file, plans in (("fit.h5", case.plans), ("fresh.h5", case.later)):
         trials = record_trials(finger, plans, motions, sensors, zero, rng)
         session = Session(

@@ -46,6 +46,18 @@ def test_a_file_of_effects_is_loaded_before_the_session(tmp_path, capsys):
     assert "defines no effect" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("sessions", [["fresh"], ["fresh", "session"]])
+def test_ctrl_c_leaves_no_empty_folder(tmp_path, monkeypatch, sessions):
+    def pressed(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxfinger.gap.diagnose", pressed)
+    demo = Path(__file__).parents[2] / "datasets" / "demo-finger"
+    with pytest.raises((SystemExit, KeyboardInterrupt)):
+        main(["diagnose", *(f"{demo / name}.h5" for name in sessions), "-o", f"{tmp_path}/new/out"])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_fit_of_the_session_itself_is_said_to_count_twice(tmp_path, capsys, monkeypatch):
     path = Path(__file__).parents[2] / "datasets" / "demo-finger" / "fresh.h5"
     session = read_session(path)

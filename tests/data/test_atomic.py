@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
 
 from jaxfinger.data import read_session, write_session
-from jaxfinger.data.atomic import MIN_ORPHAN_AGE, atomic_path
+from jaxfinger.data.atomic import MIN_ORPHAN_AGE, atomic_path, folder_to_fill
 from jaxfinger.data.predictions import write_predictions
 from jaxfinger.errors import UserError
 
@@ -85,3 +85,34 @@ def test_what_a_killed_process_left_is_removed_and_what_another_writes_is_not(tm
             assert len(names) == 4  # The other two are the parts of the two writers.
         living.stdin.close()
     assert file.read_text() == "whole"
+
+
+@pytest.mark.parametrize("ends", [KeyboardInterrupt, UserError, None])
+def test_a_folder_that_work_made_and_did_not_fill_is_removed(tmp_path, ends):
+    """However the work ends; a folder that was there before stays, and so does one that is filled."""
+    (tmp_path / "mine").mkdir()
+
+    def work(path, *fills):
+        with folder_to_fill(tmp_path / path) as folder:
+            assert folder.is_dir()
+            for name in fills:
+                (folder / name).touch()
+            if ends is not None:
+                raise ends
+
+    for path in ("mine", "new", "mine/new", "a/b"):
+        with nullcontext() if ends is None else pytest.raises(ends):
+            work(path)
+    assert [p.name for p in tmp_path.rglob("*")] == ["mine"]
+    with nullcontext() if ends is None else pytest.raises(ends):
+        work("a/b", "gap.json")
+    assert (tmp_path / "a/b/gap.json").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_a_sentence_and_leaves_none(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="file: is a file; choose another folder"), folder_to_fill(tmp_path / "file"):
+        pass
+    with pytest.raises(UserError, match="cannot be made"), folder_to_fill(tmp_path / "new" / ("x" * 300)):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
