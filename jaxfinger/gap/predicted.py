@@ -8,11 +8,12 @@ from jaxtyping import Float
 
 from jaxfinger.data import Predictions, Session, Trial
 from jaxfinger.data.findings import Finding, Report, merged
-from jaxfinger.data.predictions import refuse_misfits
+from jaxfinger.data.predictions import predicted_at, refuse_misfits
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError, counted, listed
 from jaxfinger.experiments import EXPERIMENTS
+from jaxfinger.gap.comparison import compare
 from jaxfinger.gap.likeness import check_likeness
 
 # Share of a column's range: changes below it are rounding of a computation.
@@ -34,6 +35,7 @@ def check_predictions(session: Session, predictions: Predictions) -> Report:
     refuse_misfits(session, predictions)
     report = Report()
     _report_coverage(session, predictions, report)
+    _report_other_motion(session, predictions, report)
     _report_unmeasured(session, predictions, report)
     _report_steps(session, predictions, report)
     _report_digits(session, predictions, report)
@@ -84,6 +86,21 @@ def _report_coverage(session: Session, predictions: Predictions, report: Report)
         parts = [f"{predicted[e]} of {n} {e}" for e, n in recorded.items() if predicted[e]]
         said = f"{len(counts)} of {len(session)} trials are predicted ({', '.join(parts)})"
         report.note("/", f"{said}; the diagnosis rests on these alone")
+
+
+def _report_other_motion(session: Session, predictions: Predictions, report: Report) -> None:
+    """Report angles that a simulator read and that are not the session's; those of VD.3 it may have predicted."""
+    for trial in session:
+        told = predictions.get(trial.name, {})
+        if "q" in told and trial.experiment != "VD.3":
+            angles = compare(trial.name, "q", trial.q, predicted_at(told, "q", trial, trial.q.shape))
+            if other := [
+                name for name, unlike in zip(session.finger.joint_names, angles.unlike, strict=True) if unlike
+            ]:
+                said = f"predictions were made for another motion of {listed(other)} than the session's"
+                report.error(
+                    f"/trials/{trial.name}/q", f"{said}; predict this session, at its own angles and in their units"
+                )
 
 
 def _report_unmeasured(session: Session, predictions: Predictions, report: Report) -> None:

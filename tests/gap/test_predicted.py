@@ -197,6 +197,21 @@ def test_stretch_at_held_joints_is_not_asked_for(session, predictions):
     assert list(check_predictions(session, changed(predictions, lambda v: 0.0 * v, "tendon_excursion", held))) == []
 
 
+def test_predictions_of_another_motion_are_refused_by_their_angles(session, predictions):
+    """Of a session with the same names and lengths of trials; angles of VD.3 are predicted, and may be poor."""
+    rng = np.random.default_rng(3)
+
+    def with_angles(angles):
+        return {n: channels | {"q": angles(session[n].q)} for n, channels in predictions.items()}
+
+    assert list(check_predictions(session, with_angles(lambda q: q))) == []
+    assert list(check_predictions(session, with_angles(lambda q: q + 1e-3 * rng.standard_normal(q.shape)))) == []
+    for angles, experiment in ((np.flipud, "ID.3-dynamic"), (np.rad2deg, "ID.2"), (np.zeros_like, "ID.2")):
+        sentence, *_ = said(session, with_angles(angles), "error")
+        says = "q: predictions were made for another motion of MCP than the session's; predict this session, at its own"
+        assert sentence.startswith(f"/trials/{names_of(session, experiment)[0]}/{says}")
+
+
 # Coverage -------------------------------------------------------------------------------------------------------------
 def test_how_many_trials_count_is_said(session, predictions):
     names = names_of(session, "ID.3-dynamic")
