@@ -164,9 +164,10 @@ def _report_other_names(finger: FingerDescription, of_session: FingerDescription
 def _inputs(trials: h5py.Group) -> list[str]:
     """Channels that some trials of a file hold and no model predicts of their experiments, but reads."""
     found = set()
-    for trial in (trials.get(name) for name in trials):
+    for name in trials:
+        trial = trials.get(name)
         if isinstance(trial, h5py.Group):
-            predicted = {"q"} if text_attribute(trial, "experiment", trial.name, Report()) == "VD.3" else set()
+            predicted = {"q"} if text_attribute(trial, "experiment", f"/trials/{name}", Report()) == "VD.3" else set()
             found |= {"q", "tendon_force"} & trial.keys() - predicted
     return sorted(found)
 

@@ -46,6 +46,13 @@ class Shape:
     # Where the shape is a period in the session's time: the amplitudes of its cosine and sine. A fine scan finds the
     # period, since the cost has many local minima along it.
     period_of: tuple[str, str] | None = None
+    # Words for each value, where the shape chooses a form that people are to know of: its number tells them nothing.
+    says: tuple[str, ...] = ()
+
+    @property
+    def fixed(self) -> bool:
+        """Whether no refit moves it: it chooses a form, or has one value."""
+        return self.moves == "not" or len(self.values) == 1
 
 
 def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, most: float = np.inf) -> Any:
@@ -63,19 +70,29 @@ def amplitude(units: str, size: float, of: str = "1", *, signed: bool = False, m
 
 
 def shape(
-    units: str, values: tuple[float, ...], of: str = "1", *, moves: str = "by factors", period_of: Any = None
+    units: str,
+    values: tuple[float, ...],
+    of: str = "1",
+    *,
+    moves: str = "by factors",
+    period_of: Any = None,
+    says: tuple[str, ...] = (),
 ) -> Any:
     """Declare a field that is a shape, with the `values` to try in units of the scale `of`. The first is its default.
 
-    `moves`: how a refit moves it, `by factors`, `by differences`, or `not`.
+    `moves`: how a refit moves it, `by factors`, `by differences`, or `not`. `says`: words for each value of a shape
+    that does not move, which people read in place of its number.
 
     Raises:
-        ValueError: `moves` is none of the three, or `of` is no product of scales.
+        ValueError: `moves` is none of the three, `says` has not one text for each value that does not move, or `of` is
+            no product of scales.
     """
     refuse_unknown_scale(of)
     if moves not in ("by factors", "by differences", "not"):
         raise ValueError(f"a shape moves by factors, by differences or not, where {moves!r} stands")
-    return eqx.field(metadata={"parameter": Shape(units, tuple(values), of, moves, period_of)})
+    if says and (moves != "not" or len(says) != len(values)):
+        raise ValueError(f"a shape says one text for each of its values, and does not move, where {says!r} stands")
+    return eqx.field(metadata={"parameter": Shape(units, tuple(values), of, moves, period_of, tuple(says))})
 
 
 class CatalogueEffect(Effect):
@@ -224,9 +241,9 @@ class CatalogueEffect(Effect):
         """
         ends = {n: (p.least, p.most) for n, p in self.amplitudes().items()}
         for n, values in self.worth_trying(scales, self.site).items():
-            moves = self.shape_parameters()[n].moves
-            if moves != "not" and len(values) > 1:
-                margin = 1.0 if moves == "by differences" else 2.0
+            p = self.shape_parameters()[n]
+            if not p.fixed:
+                margin = 1.0 if p.moves == "by differences" else 2.0
                 ends[n] = (min(values) / margin, max(values) * margin)
         return ends
 
@@ -234,6 +251,12 @@ class CatalogueEffect(Effect):
     def units(cls) -> dict[str, str]:
         """Units of every parameter, for revolute joints."""
         return {n: p.units for n, p in cls.parameters().items()}
+
+    @classmethod
+    def form(cls, finger: Finger, values: Mapping[str, float]) -> list[str]:
+        """What the shapes that choose a form mean at these values, in words."""
+        said = {n: p for n, p in cls.shape_parameters().items() if p.says and values.get(n) in p.values}
+        return [p.says[p.values.index(values[n])] for n, p in said.items()]
 
     def values(self) -> dict[str, float]:
         """Values of the parameters by name."""

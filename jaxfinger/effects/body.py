@@ -30,7 +30,9 @@ class Payload(CatalogueEffect):
     x: Float[Array, ""] = shape("m", (0.3, 0.0, 0.6), "length", moves="by differences")
     y: Float[Array, ""] = shape("m", (0.0,), "length", moves="by differences")
     z: Float[Array, ""] = shape("m", (0.0, 0.15, -0.15), "length", moves="by differences")
-    moved: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
+    moved: Float[Array, ""] = shape(
+        "1", (0.0, 1.0), moves="not", says=("added to the link", "moved there from elsewhere in the link")
+    )
 
     def bounds(self, scales):
         """Bounds that leave a link a tenth of its mass where mass is moved within it."""

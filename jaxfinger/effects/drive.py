@@ -87,7 +87,9 @@ class JointFrictionWarmup(CatalogueEffect):
     a: Float[Array, ""] = amplitude("1", 0.3, signed=True)
     d: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed", signed=True)
     T: Float[Array, ""] = shape("s", (0.2, 0.05, 0.8), "session")
-    by: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
+    by: Float[Array, ""] = shape(
+        "1", (0.0, 1.0), moves="not", says=("with the session's time", "with the joint's temperature")
+    )
 
     @classmethod
     def sensible(cls, scales, site, shapes):
@@ -125,7 +127,9 @@ class JointCoupling(CatalogueEffect):
     coulomb: Float[Array, ""] = amplitude("N m", 0.1, "torque")
     damping: Float[Array, ""] = amplitude("N m s/rad", 0.03, "torque/speed")
     inertia: Float[Array, ""] = amplitude("kg m2", 0.2, "mass*length*length")
-    ratio: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
+    ratio: Float[Array, ""] = shape(
+        "1", (1.0, -1.0), moves="not", says=("by the sum of both speeds", "by their difference")
+    )
 
     def _ways(self, m: int) -> Float[Array, " m"]:
         """Factors of the m joints' speeds in the motor's speed."""

@@ -30,7 +30,7 @@ class JointStribeck(CatalogueEffect):
 
     a: Float[Array, ""] = amplitude("1", 0.5)
     v_s: Float[Array, ""] = shape("rad/s", (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.5), "speed")
-    delta: Float[Array, ""] = shape("1", (1.0, 2.0), moves="not")
+    delta: Float[Array, ""] = shape("1", (1.0, 2.0), moves="not", says=("exponential in speed", "Gaussian in speed"))
 
     @classmethod
     def sensible(cls, scales, site, shapes):
@@ -116,7 +116,12 @@ class ElasticHardening(_TowardsAnEnd):
 
     tau_end: Float[Array, ""] = amplitude("N m", 0.4, "torque")
     width: Float[Array, ""] = shape("rad", (0.07, 0.15, 0.3, 0.5), "angle")
-    end: Float[Array, ""] = shape("1", (1.0, -1.0, 0.0), moves="not")
+    end: Float[Array, ""] = shape(
+        "1",
+        (1.0, -1.0, 0.0),
+        moves="not",
+        says=("towards the upper limit", "towards the lower limit", "towards both limits"),
+    )
 
     def torque(self, x, memory, h):
         i = self.index[0]
@@ -140,7 +145,12 @@ class JointStop(_TowardsAnEnd):
 
     stiffness: Float[Array, ""] = amplitude("N m/rad", 3.0, "torque/angle")
     place: Float[Array, ""] = shape("1", (0.55, 0.62, 0.69, 0.76, 0.82, 0.88, 0.94), moves="by differences")
-    end: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
+    end: Float[Array, ""] = shape(
+        "1",
+        (1.0, -1.0),
+        moves="not",
+        says=("a stop on the way to the upper limit", "a stop on the way to the lower limit"),
+    )
     damping: Float[Array, ""] = shape("s/rad", (0.0,), moves="not")
 
     def torque(self, x, memory, h):
@@ -195,7 +205,12 @@ class PassiveTendon(CatalogueEffect):
     kappa: Float[Array, ""] = amplitude("N m/rad", 1.5, "torque/angle")
     rho: Float[Array, ""] = shape("1", (0.5, 0.8, 1.0, 1.3, 2.0))
     phi: Float[Array, ""] = shape("rad", (-0.7, -0.35, -0.18, 0.0, 0.18, 0.35), "angle", moves="by differences")
-    side: Float[Array, ""] = shape("1", (1.0, -1.0), moves="not")
+    side: Float[Array, ""] = shape(
+        "1",
+        (1.0, -1.0),
+        moves="not",
+        says=("taut where q_a − rho q_b exceeds phi", "taut where q_a − rho q_b is below phi"),
+    )
 
     def torque(self, x, memory, h):
         a, b = self.index

@@ -24,4 +24,4 @@ def dahl(z: Float[Array, "*T"], dx: Float[Array, "*T"], delta: Float[Array, ""])
 
 def delta() -> Any:
     """Declare a shape that chooses the exponent of `dahl`."""
-    return shape("1", (1.0, 0.5), moves="not")
+    return shape("1", (1.0, 0.5), moves="not", says=("built up exponentially", "fully built up within 2.8 lengths"))

@@ -22,7 +22,9 @@ class RelaxingEffect(CatalogueEffect):
     """
 
     T: Float[Array, ""]
-    decades: Float[Array, ""] = shape("1", (0.0, WIDE), moves="not")
+    decades: Float[Array, ""] = shape(
+        "1", (0.0, WIDE), moves="not", says=("one time constant", "times from a decade below T to a decade above")
+    )
 
     @classmethod
     def shapes(cls, finger, site, scales):

@@ -111,6 +111,11 @@ class MomentArmCoupling(CatalogueEffect):
         crossed = [i for i, c in enumerate(finger.crosses[finger.tendon_names.index(site[0])]) if c]
         return [{"joint_a": float(a), "joint_b": float(b)} for a, b in combinations(crossed, 2)]
 
+    @classmethod
+    def form(cls, finger, values):
+        """The two joints, by name."""
+        return [f"of {' and '.join(finger.joint_names[int(values[n])] for n in cls.shape_parameters())}"]
+
     def _joints(self):
         return self.joint_a.astype(int), self.joint_b.astype(int)
 

@@ -26,7 +26,9 @@ class TendonFrictionCapstan(CatalogueEffect):
 
     crossed: Float[Array, " m"]
     mu: Float[Array, ""] = amplitude("1/rad", 0.1)
-    curvature: Float[Array, ""] = shape("1", (1.0, 0.0), moves="not")
+    curvature: Float[Array, ""] = shape(
+        "1", (1.0, 0.0), moves="not", says=("Euler and Eytelwein's law", "in proportion to the wrap")
+    )
 
     @classmethod
     def constants(cls, finger, site):
@@ -73,7 +75,9 @@ class TendonFrictionPresliding(CatalogueEffect):
     a: Float[Array, ""] = amplitude("1", 1.0, most=1.0)
     x0: Float[Array, ""] = shape("m", (0.0025, 0.008, 0.025, 0.08, 0.25), "excursion")
     f0: Float[Array, ""] = shape("N", (0.03, 0.1, 0.3), "tension")
-    stretches: Float[Array, ""] = shape("1", (1.0, 0.0), moves="not")
+    stretches: Float[Array, ""] = shape(
+        "1", (1.0, 0.0), moves="not", says=("at held joints too", "at moving joints alone")
+    )
     delta: Float[Array, ""] = delta()
 
     @classmethod
@@ -135,7 +139,12 @@ class TendonCrosstalk(CatalogueEffect):
     SIZES: ClassVar = (1.0, 0.05)
 
     epsilon: Float[Array, ""] = amplitude("1", 0.05)
-    behind: Float[Array, ""] = shape("1", (0.0, 1.0), moves="not")
+    behind: Float[Array, ""] = shape(
+        "1",
+        (0.0, 1.0),
+        moves="not",
+        says=("before the friction of the tendon that is dragged", "past the friction of both tendons"),
+    )
     onset: Float[Array, ""] = shape("N", (0.0, 0.4), "tension", moves="by differences")
 
     def _drag(self, f):

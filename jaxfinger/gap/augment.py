@@ -141,7 +141,7 @@ def _moving(effect: CatalogueEffect) -> CatalogueEffect:
 
     Fixed are choices (form, side, place) and amplitudes of the largest magnitude.
     """
-    stays = {n for n, p in effect.shape_parameters().items() if p.moves == "not" or len(p.values) == 1}
+    stays = {n for n, p in effect.shape_parameters().items() if p.fixed}
     stays |= {n for n, p in effect.amplitudes().items() if abs(float(getattr(effect, n))) >= p.most}
     return replace(effect, **{n: jnp.asarray(n not in stays, dtype=float) for n in effect.values()})
 

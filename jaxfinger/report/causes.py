@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from jaxfinger.effects import CATALOGUE, CHANGED, NOMINAL_TERMS, CatalogueEffect
-from jaxfinger.gap.result import Diagnosis
+from jaxfinger.gap.result import Diagnosis, Value
+from jaxfinger.report.numbers import measured
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,32 @@ class Words:
 
 def words(effect: str, d: Diagnosis) -> Words:
     """Texts about an effect of the catalogue, a term of the nominal model, a user's effect or a changed parameter."""
+    cls = _known(d).get(effect)
+    return Words(cls.HAPPENS, cls.LOOKS, cls.CHANGE, first_sentence(cls)) if cls else Words("")
+
+
+def parameters(effect: str, values: Sequence[Value], d: Diagnosis) -> list[tuple[str, str]]:
+    """Name and text of every parameter of a cause that people read: its value with its interval.
+
+    A shape that no refit moves is left out. Where it chooses a form, words without a name say which. Both name their
+    site where there are several.
+    """
+    cls, out = _known(d).get(effect), []
+    sites = dict.fromkeys(v.site for v in values)
+    for site in sites:
+        own, at = {v.name: v for v in values if v.site == site}, "-".join(site) if len(sites) > 1 else ""
+        fixed = {n for n, p in cls.shape_parameters().items() if p.fixed} if cls else set()
+        moved = [v for n, v in own.items() if n not in fixed]
+        out += [(f"{v.name} {at}".rstrip(), measured(v.value, v.std, v.units)) for v in moved]
+        if cls:
+            out += [(at, text) for text in cls.form(d.nominal.model.finger, {n: v.value for n, v in own.items()})]
+    return out
+
+
+def _known(d: Diagnosis) -> Mapping[str, type[CatalogueEffect]]:
+    """Effects by id: of the catalogue, of the nominal model, changes, and the user's own that the diagnosis names."""
     of_model = {e.ID: type(e) for e in d.augmented.model.effects if isinstance(e, CatalogueEffect)}
-    known = of_model | NOMINAL_TERMS | CHANGED | CATALOGUE
-    if effect not in known:
-        return Words("")
-    cls = known[effect]
-    return Words(cls.HAPPENS, cls.LOOKS, cls.CHANGE, first_sentence(cls))
+    return of_model | NOMINAL_TERMS | CHANGED | CATALOGUE
 
 
 def first_sentence(cls: type) -> str:

@@ -16,11 +16,11 @@ from jaxfinger.data.schema import channel_units, units_where
 from jaxfinger.gap.parts import MIN_VARIABLE_SHARE
 from jaxfinger.gap.result import Absorbed, Candidate, Cause, Closure, Diagnosis, Key, Left, Place, Status, Value
 from jaxfinger.report import plots, sentences
-from jaxfinger.report.causes import words
+from jaxfinger.report.causes import parameters, words
 from jaxfinger.report.curves import Curves, model_curves
 from jaxfinger.report.measured import arm_points
 from jaxfinger.report.names import VARIABLE_NAMES, cause_name, channel_name, effect_name, joined, key_name, site_names
-from jaxfinger.report.numbers import HALF_95, chance, measured, percent, quantity, unbroken
+from jaxfinger.report.numbers import HALF_95, chance, percent, quantity, unbroken
 from jaxfinger.report.plots import gap as gap_plots
 from jaxfinger.report.plots.fit import INTERVAL_ROWS, interval_size
 from jaxfinger.report.theme import PALETTE, css, grid, inline, look
@@ -241,7 +241,7 @@ def _card(d: Diagnosis, k: int, c: Cause) -> dict:
     return _texts(d, k, c.effect) | {
         "name": sentences.sentence(cause_name(c)).rstrip("."),
         "says": says,
-        "sizes": [_value(v, len(c.sites) > 1) for v in c.values],
+        "sizes": _sizes(c.effect, c.values, d),
     }
 
 
@@ -249,7 +249,7 @@ def _rival(d: Diagnosis, k: int, c: Candidate | None, key: Key) -> dict:
     return _texts(d, k, key.effect) | {
         "name": sentences.sentence(key_name(key)).rstrip("."),
         "says": f"Probability {chance(c.probability)}." if c else "",
-        "sizes": [_value(v, False) for v in c.values] if c else [],
+        "sizes": _sizes(key.effect, c.values, d) if c else [],
     }
 
 
@@ -258,9 +258,9 @@ def _texts(d: Diagnosis, k: int, effect: str) -> dict:
     return {"colour": PALETTE[k % len(PALETTE)].name} | asdict(words(effect, d))
 
 
-def _value(v: Value, sites: bool) -> str:
-    where = f" {'-'.join(v.site)}" if sites else ""
-    return f"{v.name}{where}: {measured(v.value, v.std, v.units)}"
+def _sizes(effect: str, values: Sequence[Value], d: Diagnosis) -> list[str]:
+    """Parameters of a cause, one text each."""
+    return [": ".join(filter(None, pair)) for pair in parameters(effect, values, d)]
 
 
 def _place(p: Place, prismatic: tuple[bool, ...]) -> dict:

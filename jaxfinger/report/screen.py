@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from jaxfinger.gap.result import Cause, ChannelBudget, Closure, Diagnosis, Key
 from jaxfinger.report import sentences
+from jaxfinger.report.causes import parameters
 from jaxfinger.report.names import cause_name, channel_name, effect_name, key_name, site_names
 from jaxfinger.report.numbers import chance, measured, quantity, unbroken
 from jaxfinger.report.plots.gap import rows_of, segments, shown
@@ -95,8 +96,7 @@ def _legend(d: Diagnosis) -> str:
 
 def _cause(d: Diagnosis, k: int, c: Cause) -> list[str]:
     says = f"{sentences.shared(d, c)}, probability {chance(c.probability)}"
-    at = [f" {'-'.join(v.site)}" if len(c.sites) > 1 else "" for v in c.values]
-    values = [f"{v.name}{where} {measured(v.value, v.std, v.units)}" for v, where in zip(c.values, at, strict=True)]
+    values = [" ".join(pair).lstrip() for pair in parameters(c.effect, c.values, d)]
     first, *rest = _wrapped(f"{SIGNS[k % len(SIGNS)]} {cause_name(c)}: {says}", "  ")
     return [first, *("    " + line for line in rest), *_wrapped("; ".join(values), " " * 6)]
 

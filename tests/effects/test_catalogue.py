@@ -21,6 +21,7 @@ from jaxfinger.effects import (
     load,
     nominal_terms,
     own_effects,
+    shape,
     to_dict,
 )
 from jaxfinger.errors import UserError
@@ -93,13 +94,28 @@ def test_every_site_and_shape(name):
         assert set(channels) <= set(EXPERIMENTS[experiment].channels)
     seen = set()
     for site in sites:
-        for shape in kind.shapes(FINGER, site, SCALES):
-            effect = plausible(kind, site, shape)
+        for shapes in kind.shapes(FINGER, site, SCALES):
+            effect = plausible(kind, site, shapes)
             seen.add((effect.site, *effect.values().items()))
             assert set(effect.values()) == set(kind.parameters()) == set(kind.units())
             read = from_dict(FINGER, written(effect))
             assert eqx.tree_equal(read, effect)
     assert len(seen) == sum(len(kind.shapes(FINGER, s, SCALES)) for s in sites)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_form_has_words_of_its_own(name):
+    """People read them in place of the numbers of shapes that do not move."""
+    kind, site = EVERY[name], EVERY[name].sites(FINGER)[0]
+    chosen = [n for n, p in kind.shape_parameters().items() if p.moves == "not"]
+    forms = {tuple(s[n] for n in chosen): kind.form(FINGER, s) for s in kind.shapes(FINGER, site, SCALES)}
+    assert len({*map(tuple, forms.values())}) == len(forms)
+
+
+@pytest.mark.parametrize("given", [dict(says=("a", "b")), dict(moves="not", says=("a",))])
+def test_words_are_for_each_value_of_a_shape_that_does_not_move(given):
+    with pytest.raises(ValueError, match="one text for each of its values"):
+        shape("1", (0.0, 1.0), **given)
 
 
 def test_no_prediction_calls_lapack():
@@ -369,8 +385,8 @@ def test_a_scale_is_a_product_at_its_site():
 def test_an_effect_on_a_link_leaves_it_a_body_at_all_that_its_bounds_allow(name, end):
     """Its mass stays positive, and no moment of inertia exceeds the sum of the other two (triangle inequality)."""
     kind, site = EVERY[name], FINGER.joint_names[1:2]
-    for shape in kind.shapes(FINGER, site, SCALES):
-        effect = plausible(kind, site, shape, 50.0)
+    for shapes in kind.shapes(FINGER, site, SCALES):
+        effect = plausible(kind, site, shapes, 50.0)
         most = {n: ends[end] for n, ends in effect.bounds(SCALES).items() if np.isfinite(ends[end])}
         finger = replace(effect, **{n: jnp.asarray(v) for n, v in most.items()}).finger(FINGER)
         assert finger.mass[1] > 0.0

@@ -95,7 +95,15 @@ COUPLED = Cause(
     0.5,
     (0.4, 0.6),
     {EXCURSION: 0.5},
-    tuple(Value((f"T{k}",), "q1q2", 1e-3 * k, 1e-5, "m/rad^2") for k in range(1, 6)),
+    tuple(
+        Value((f"T{k}",), name, value, std, units)
+        for k in range(1, 6)
+        for name, value, std, units in (
+            ("A", 1e-3 * k, 1e-5, "m/rad^2"),
+            ("joint_a", 0.0, 0.0, "1"),
+            ("joint_b", 1.0, 0.0, "1"),
+        )
+    ),
 )
 SMALL = Relevance("VD.1", "tendon_excursion", "m", 6e-6, 0.02, 3e-4, False)
 LARGE = Relevance("ID.4", "joint_torque", "N m", 1.2e-3, 0.03, 0.04, False)

@@ -49,7 +49,7 @@ def test_one_cause_at_many_sites_is_one_line_and_every_site_is_named():
     gap = as_gap_json(ALL["coupled"])
     (line,) = gap["budget"]
     assert line["site"] == ["T1", "T2", "T3", "T4", "T5"]
-    assert line["parameters"]["q1q2 T4"]["value"] == pytest.approx(4e-3)
+    assert line["parameters"]["A T4"]["value"] == pytest.approx(4e-3)
     assert [e["site"] for e in gap["verdict"]["effects"]] == [["T1"], ["T2"], ["T3"], ["T4"], ["T5"]]
 
 

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from jaxfinger.gap.result import Value
 from jaxfinger.report import sentences
+from jaxfinger.report.causes import parameters
 from jaxfinger.report.screen import comparison, summary
 
 from .fabricated import every
@@ -37,6 +39,27 @@ def test_what_came_of_effects_of_ones_own_is_said():
     assert "tendon creep: no trial shows it" in text
     assert "YOURS" not in summary(ALL["two"], ["tendon_stretch"])  # which is named
     assert "YOURS" not in summary(d)
+
+
+def test_what_no_refit_moves_is_said_in_words_or_not_at_all():
+    """A load lies in the finger's plane, and whether it is the link's own is no number."""
+    values = {"mass": (0.02, 1e-3, "kg"), "x": (0.03, 1e-3, "m"), "y": (0.0, 0.0, "m"), "moved": (0.0, 0.0, "1")}
+    site = ("PIP",)
+    loaded = replace(
+        ALL["explained"].budget[0],
+        effect="payload",
+        sites=(site,),
+        values=tuple(Value(site, name, *of) for name, of in values.items()),
+    )
+    d = replace(ALL["explained"], named=loaded.keys, budget=(loaded,))
+    assert "      mass 20.0 ± 2.0 g; x 30.0 ± 2.0 mm; added to the link" in summary(d).splitlines()
+    assert parameters("payload", loaded.values, d) == [
+        ("mass", "20.0 ± 2.0 g"),
+        ("x", "30.0 ± 2.0 mm"),
+        ("", "added to the link"),
+    ]
+    coupled = parameters("moment_arm_coupling", ALL["coupled"].budget[0].values, d)
+    assert coupled[:2] == [("A T1", "1.000 ± 0.020 mm/rad²"), ("T1", "of MCP and PIP")]
 
 
 def test_a_table_of_several_sessions_says_which_cause_is_at_work_in_which():
