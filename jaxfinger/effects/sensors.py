@@ -6,13 +6,12 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from scipy.signal.windows import tukey
 
 from jaxfinger.effects.base import CatalogueEffect, amplitude, shape
 from jaxfinger.effects.rotation import turned
-
-# Central differences of the sixth order: distance in samples, and weight (Fornberg, Math. Comp. 51 (1988) 699).
-_SIXTH_ORDER = ((1, 0.75), (2, -0.15), (3, 1 / 60))
 
 
 class TorqueSensorScale(CatalogueEffect):
@@ -166,8 +165,8 @@ DELAYED_CHANNELS = ("q", "tendon_force", "tendon_excursion", "joint_torque", "fi
 class ChannelDelay(CatalogueEffect):
     """y(t − delay): one channel lags the others. In trials with held joints it shows nothing.
 
-    The recording is read as much later. To first order, y + delay ẏ, the channel's noise would grow with the delay, and
-    a fit would prefer too short a one.
+    The recording is read as much later (`read_later`), with as much noise as before. To first order, y + delay ẏ, noise
+    would grow with the delay, and a fit would prefer too short a one.
     """
 
     ID: ClassVar = "channel_delay"
@@ -205,50 +204,32 @@ class ChannelDelay(CatalogueEffect):
             return y
         late = read_later(y, x.time, -self._of(channel))
         if channel == "joint_torque":
-            # No sensor measures the free finger's external torque, which is zero by definition. A joint at rest has no
-            # rate; the differences at the first and last sample of a hold would reach into the motion beside it.
+            # No sensor measures the free finger's external torque, which is zero by definition. At a hold nothing is
+            # late; its first and last sample would be read in the motion beside it.
             return jnp.where((x.qd != 0.0) & (x.motorised > 0.0), late, y)
         return late
 
 
 def read_later(y: Float[Array, "*T"], time: Float[Array, "*#T"], by: Float[Array, ""]) -> Float[Array, "*T"]:
-    """y(t + by), along the last axis: cubic Hermite interpolation between samples, with the slopes of `rate`.
+    """y(t + by), along the last axis of evenly spaced samples: a shift of phase by 2π `by` in every frequency.
 
-    Beyond the first and last sample y goes on with the slope there.
+    It leaves the spectrum of noise as it is. Interpolation between samples lessens noise, most of all half-way, so that
+    a fit would prefer such delays. Before the first sample and after the last one y goes on as its own reflection in
+    that point. Samples whose time stands still, at the end, pad a trial.
     """
-    each = jnp.broadcast_to(by, y.shape[:-1])
-    return _interpolated(y, rate(y, time), jnp.broadcast_to(time, y.shape), each)
+    return _shifted(y, jnp.broadcast_to(time, y.shape), jnp.broadcast_to(by, y.shape[:-1]))
 
 
-@partial(jnp.vectorize, signature="(t),(t),(t),()->(t)")
-def _interpolated(y, slope, time, by):
-    inside = jnp.clip(time + by, time[0], time[-1])
-    i = jnp.clip(jnp.searchsorted(time, inside, side="right") - 1, 0, time.size - 2)
-    h = time[i + 1] - time[i]
-    u = jnp.where(h > 0.0, (inside - time[i]) / jnp.where(h > 0.0, h, 1.0), 0.0)
-    values = (1.0 + 2.0 * u) * (1.0 - u) ** 2 * y[i] + u**2 * (3.0 - 2.0 * u) * y[i + 1]
-    slopes = u * (1.0 - u) ** 2 * slope[i] - u**2 * (1.0 - u) * slope[i + 1]
-    return values + h * slopes + (time + by - inside) * jnp.where(by < 0.0, slope[0], slope[-1])
-
-
-def rate(y: Float[Array, "*T"], time: Float[Array, "*#T"]) -> Float[Array, "*T"]:
-    """Time derivative along the last axis, 1/s. It is zero where time stands still.
-
-    Evenly spaced samples have central differences of the sixth order, since those of the second order attenuate fast
-    changes of reduced channels. Other samples, and the first and last three, have the second order.
-    """
-    time = jnp.broadcast_to(time, y.shape)
-    dy, dt = (jnp.asarray(jnp.gradient(a, axis=-1)) for a in (y, time))
-    slope = jnp.where(dt > 0, dy / jnp.where(dt > 0, dt, 1.0), 0.0)
-    if y.shape[-1] < 7:
-        return slope
-
-    def wide(a):
-        return sum(
-            w * (a[..., 3 + k : a.shape[-1] - 3 + k] - a[..., 3 - k : a.shape[-1] - 3 - k]) for k, w in _SIXTH_ORDER
-        )
-
-    inner, step = wide(time), dt[..., 3:-3]
-    even = (step > 0) & (jnp.abs(time[..., 6:] - time[..., :-6] - 6.0 * step) < 0.01 * step)
-    smooth = jnp.where(even, wide(y) / jnp.where(even, inner, 1.0), slope[..., 3:-3])
-    return slope.at[..., 3:-3].set(smooth)
+@partial(jnp.vectorize, signature="(t),(t),()->(t)")
+def _shifted(y, time, by):
+    size, lead = time.size, time.size // 2
+    last = jnp.maximum(jnp.sum(jnp.diff(time) > 0.0), 1)
+    lasts = jnp.where(time[-1] > time[0], time[-1] - time[0], 1.0)
+    slope = (y[-1] - y[0]) / lasts
+    level = y - y[0] - slope * (time - time[0])  # zero at both ends, so that its reflections have a period
+    place = (jnp.arange(2 * size) - lead) % (2 * last)
+    reflected = jnp.where(place <= last, level[jnp.minimum(place, last)], -level[2 * last - jnp.maximum(place, last)])
+    spectrum = jnp.fft.rfft(reflected * tukey(2 * size, 0.25))
+    phase = 2.0 * np.pi * np.fft.rfftfreq(2 * size) * (by * last.astype(by.dtype) / lasts)
+    change = jnp.fft.irfft(spectrum * jax.lax.complex(jnp.cos(phase) - 1.0, jnp.sin(phase)), 2 * size)
+    return y + slope * by + change[lead : lead + size]

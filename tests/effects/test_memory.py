@@ -15,7 +15,7 @@ from scipy.special import exp1
 from jaxfinger.data import filter_std, low_pass, smooth
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.effects.presliding import dahl
-from jaxfinger.effects.sensors import rate, read_later
+from jaxfinger.effects.sensors import read_later
 from jaxfinger.model import excursion, joint_tension, memories
 from jaxfinger.model.dynamics import terms
 from jaxfinger.model.rigid_body import inverse_dynamics
@@ -236,22 +236,40 @@ def test_moment_arms_are_derivatives_of_the_excursion(name, values):
 
 
 def test_a_delayed_channel_is_the_signal_a_while_ago():
-    """Of a quarter of a sample, and of several; at the ends the signal goes on with its slope."""
+    """Of a quarter of a sample, and of several; at the ends the signal goes on as its own reflection."""
     for delay in (2.5e-3, 35e-3):
         effect = CATALOGUE["channel_delay"].at(FINGER, ("tendon_excursion",), delay=delay)
         read = effect.reading("tendon_excursion", X, jnp.asarray(np.sin(2 * np.pi * TIME))[None])
         late = np.sin(2 * np.pi * (TIME - delay))
-        np.testing.assert_allclose(read[0, 4:-4], late[4:-4], atol=1e-5)
-        np.testing.assert_allclose(read[0, :4], late[:4], atol=0.5 * (2 * np.pi * delay) ** 2 + 1e-3)
+        np.testing.assert_allclose(read[0, 8:-8], late[8:-8], atol=1e-3)
+        np.testing.assert_allclose(read[0], late, atol=0.5 * (2 * np.pi * delay) ** 2 + 2e-3)
 
 
-@pytest.mark.parametrize("delay", [4e-3, 8e-3, 50e-3])
-def test_a_delay_leaves_the_size_of_noise(delay):
-    """y + delay ẏ would add a quarter to the variance of reduced channels' noise at 8 ms, and a fit would shun it."""
-    time = np.arange(4000) / 50.0
-    noise = gaussian_filter1d(np.random.default_rng(0).normal(size=time.size), 1.0)
-    moved = read_later(jnp.asarray(noise), jnp.asarray(time), jnp.asarray(delay))
-    np.testing.assert_allclose(np.var(moved), np.var(noise), rtol=0.02)
+@pytest.mark.parametrize("width", [0.0, 1.0])
+@pytest.mark.parametrize("samples", [0.1, 0.43, 0.5, 2.5])
+def test_a_delay_leaves_the_spectrum_of_noise(width, samples):
+    """Of unfiltered and of filtered noise: at each frequency, since whitening raises those that a filter lowered.
+
+    Cubic interpolation half-way between samples leaves 73 % of the variance of white noise; y + delay ẏ adds to it.
+    """
+    rng, time = np.random.default_rng(0), np.arange(4000) / 50.0
+    noise = gaussian_filter1d(rng.normal(size=time.size), width) if width else rng.normal(size=time.size)
+    moved = np.asarray(read_later(jnp.asarray(noise), jnp.asarray(time), jnp.asarray(samples / 50.0)))
+    bands = [
+        np.add.reduceat(np.abs(np.fft.rfft(x * np.hanning(time.size))) ** 2, [0, 500, 1000, 1500])
+        for x in (moved, noise)
+    ]
+    np.testing.assert_allclose(bands[0], bands[1], rtol=0.01)
+
+
+def test_a_delay_does_not_depend_on_the_padding_of_a_trial():
+    """A padded sample repeats the last one, and time stands still there."""
+    signal = gaussian_filter1d(np.random.default_rng(1).normal(size=TIME.size), 1.0)
+    y, time = jnp.asarray(signal), jnp.asarray(TIME)
+    padded = [jnp.concatenate([a, jnp.full(40, a[-1])]) for a in (y, time)]
+    for by in (-7e-3, 4e-3):
+        alone, within = (read_later(*x, jnp.asarray(by)) for x in ((y, time), padded))
+        np.testing.assert_allclose(within[: TIME.size], alone, atol=5e-4)
 
 
 def test_a_delayed_angle_delays_its_speed_and_acceleration():
@@ -275,19 +293,9 @@ def test_an_eccentric_encoder_shows_other_speeds_and_accelerations_too():
     np.testing.assert_array_equal(x.qd[0], X.qd[0])
 
 
-def test_rates_hold_up_to_the_cut_off_of_reduced_channels():
-    """At 10 Hz and 50 samples a second they lose 2 %; differences of the second order would lose 24 %."""
-    time = np.arange(60) / 50.0
-    found = np.asarray(rate(jnp.asarray(np.sin(2 * np.pi * 10.0 * time)), jnp.asarray(time)))
-    exact = 2 * np.pi * 10.0 * np.cos(2 * np.pi * 10.0 * time)
-    np.testing.assert_allclose(found[3:-3], exact[3:-3], atol=0.025 * 2 * np.pi * 10.0)
-    uneven = np.sort(np.random.default_rng(0).uniform(0.0, 1.0, 400))
-    np.testing.assert_allclose(rate(jnp.asarray(3.0 * uneven), jnp.asarray(uneven)), 3.0, rtol=1e-9)
-
-
 @pytest.mark.parametrize("channel", ["tendon_force", "joint_torque", "tendon_excursion"])
 def test_a_delay_shows_nothing_where_all_is_at_rest(channel):
-    """At holds the rate is zero, though differences at their edges reach into the steps between them."""
+    """At holds, though their first and last samples would be read in the steps between them."""
     effect = CATALOGUE["channel_delay"].at(FINGER, (channel,), delay=5e-3)
     steps = jnp.asarray(np.repeat([[0.0, 1.0, 3.0]], 20, axis=1))
     still = replace(X, qd=jnp.zeros_like(X.qd), motorised=jnp.ones_like(X.motorised))
@@ -295,11 +303,6 @@ def test_a_delay_shows_nothing_where_all_is_at_rest(channel):
     y = jnp.broadcast_to(jnp.resize(steps, (TIME.size,)), (FINGER.m, TIME.size))
     for x in (replace(still, held=True), *([still] if channel == "joint_torque" else [])):
         np.testing.assert_array_equal(effect.reading(channel, x, y), y)
-
-
-def test_rate_is_zero_where_time_stands_still():
-    time = jnp.array([0.0, 0.1, 0.2, 0.2, 0.2])
-    np.testing.assert_allclose(rate(jnp.array([0.0, 1, 2, 2, 2]), time)[-1], 0.0)
 
 
 def test_payload_is_a_body_screwed_to_a_link():
