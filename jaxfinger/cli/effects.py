@@ -51,10 +51,20 @@ def _describe(kind) -> None:
     ):
         say.print(f"\n[bold]{title}.[/bold] ", end="")
         say.print(text, markup=False)
-    table = Table("parameter", "units", "plausible", "scale", box=None)
+    table = Table("parameter", "units", "plausible", box=None)
     for name, p in kind.amplitudes().items():
-        table.add_row(name, p.units, f"{'±' if p.signed else ''}{p.size:g}", "" if p.of == "1" else p.of)
+        table.add_row(name, p.units, f"{'±' if p.signed else ''}{p.size:g}{_times(p.of)}")
     for name, p in kind.shape_parameters().items():
-        table.add_row(name, p.units, ", ".join(f"{v:g}" for v in p.values), "" if p.of == "1" else p.of)
+        forms = [f"{v:g}: {said}" for v, said in zip(p.values, p.says, strict=False)]
+        tried = ", ".join(f"{v:g}" for v in p.values)
+        several = f"({tried})" if len(p.values) > 1 and p.of != "1" else tried
+        table.add_row(name, p.units, "\n".join(forms) or several + _times(p.of))
     say.print()
     say.print(table)
+    if any(p.of != "1" for p in kind.parameters().values()):
+        say.print("\nScales, such as torque or length, are those of the finger and of its recordings.")
+
+
+def _times(scale: str) -> str:
+    """Text of the scale of the machine that a plausible size is a multiple of."""
+    return "" if scale == "1" else f" × {scale.replace('*', ' · ')}"

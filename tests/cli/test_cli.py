@@ -415,6 +415,10 @@ def test_effects_lists_the_catalogue_and_prints_one_in_full(capsys):
     said = capsys.readouterr().out
     assert "dead zone" in said
     assert "width" in said
+    assert run("effects", "elastic_hardening") == 0
+    said = capsys.readouterr().out
+    assert "0.4 × torque" in said
+    assert "towards both limits" in said
     assert run("effects", "joint_backlas") == 2
     assert "did you mean 'joint_backlash'" in capsys.readouterr().err
 
