@@ -211,7 +211,7 @@ class ChannelDelay(CatalogueEffect):
 
 
 def read_later(y: Float[Array, "*T"], time: Float[Array, "*#T"], by: Float[Array, ""]) -> Float[Array, "*T"]:
-    """y(t + by), along the last axis of evenly spaced samples: a shift of phase by 2π `by` in every frequency.
+    """y(t + by), along the last axis of evenly spaced samples: the phase at frequency f is shifted by 2π f `by`.
 
     It leaves the spectrum of noise as it is. Interpolation between samples lessens noise, most of all half-way, so that
     a fit would prefer such delays. Before the first sample and after the last one y goes on as its own reflection in
