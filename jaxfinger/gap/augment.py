@@ -22,7 +22,8 @@ from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.intervals import evidence, laplace
 from jaxfinger.identify.parameters import describe, effect_parameter, ravel, units_at
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
+from jaxfinger.identify.solve import Solution, solve
+from jaxfinger.identify.sources import Source, residuals_each, white_tangents
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"

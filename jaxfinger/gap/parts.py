@@ -40,7 +40,7 @@ from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.smooth_laws import SmoothPart
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import Parameter, describe, effect_parameter, ravel, units_at
-from jaxfinger.identify.stages import Progress
+from jaxfinger.progress import Progress
 
 # The thresholds of this module decide what a report mentions, and no verdict.
 # Share of a signature's energy that the nominal parameters imitate, from which a cause is listed as absorbed: of what

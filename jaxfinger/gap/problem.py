@@ -26,25 +26,21 @@ from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
+from jaxfinger.identify.fit_with_noise import residuals_for_noise
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import NO_REVERSALS, White
 from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
+from jaxfinger.identify.nominal import cad_prior, free_groups, nominal_model
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.reversals import torque_changes, with_reversals
-from jaxfinger.identify.solve import ROUGH_TOLERANCE, Source, solve, white_tangents
-from jaxfinger.identify.stages import (
-    Progress,
-    cad_prior,
-    free_groups,
-    nominal_model,
-    residuals_for_noise,
-    sources_of,
-)
+from jaxfinger.identify.solve import ROUGH_TOLERANCE, solve
+from jaxfinger.identify.sources import Source, sources_of, white_tangents
 from jaxfinger.identify.start import start_values
 from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
+from jaxfinger.progress import Progress
 
 MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves
 NOISE_CHANGE = 0.2  # relative, of a channel's standard deviation: less changes no interval by as much as a tenth

@@ -34,7 +34,7 @@ from jaxfinger.gap.formula import Evidence, LinearFit, LinearModel, Weights, une
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.signatures import Variant
-from jaxfinger.identify.stages import Progress
+from jaxfinger.progress import Progress
 
 SHORT_LIST = 12  # offers that are compared with settled weights: a few for each of the likeliest causes
 MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fixed shapes

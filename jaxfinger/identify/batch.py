@@ -40,7 +40,7 @@ from jaxfinger.identify.resample import (
     variances,
 )
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
-from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.sources import sources_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these

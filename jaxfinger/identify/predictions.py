@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from jaxfinger.errors import UserError, chosen, counted, require
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Finger, Model, Motion, simulate
+from jaxfinger.progress import Progress
 
 # Longest time step of a forward simulation, in s at the protocol's pace. Steps a quarter as long change angles
 # predicted half a second ahead by less than an encoder's resolution (tests/identify/test_shooting.py).
@@ -29,7 +30,7 @@ def predict_session(
     fit: Fit | Model,
     session: Session,
     names: str | Sequence[str] | None = None,
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = lambda message: None,
 ) -> dict[str, dict[str, np.ndarray]]:
     """Predict the channels of the named trials, one or more: `{trial: {channel: (N, columns)}}`, in SI units.
 

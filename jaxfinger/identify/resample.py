@@ -30,8 +30,9 @@ from jaxfinger.identify.nominal import cad_covariance, cad_prior
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import Source, visible
-from jaxfinger.identify.stages import STAGES, sources_of, stage_free
+from jaxfinger.identify.solve import visible
+from jaxfinger.identify.sources import Source, sources_of
+from jaxfinger.identify.stages import STAGES, stage_free
 from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]

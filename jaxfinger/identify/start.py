@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxfinger.identify.linearise import white_of
 from jaxfinger.identify.parameters import Parameter
-from jaxfinger.identify.solve import Source, residuals_each
+from jaxfinger.identify.sources import Source, residuals_each
 from jaxfinger.model import Model, TendonFriction
 
 # Candidates for (a₀ over the highest tension, a₁). They span losses from 3 % to 80 % of the tension, and the forms of

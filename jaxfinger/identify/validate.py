@@ -7,7 +7,7 @@ is arbitrary. Their mean error, like the paper's, is relative to the trial's fir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from html import escape
 from typing import NamedTuple
@@ -31,6 +31,7 @@ from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.model import Model
+from jaxfinger.progress import Progress
 from jaxfinger.table import Table
 
 # Cut-off, Hz at the protocol's pace, of the causal filter with which a controller would differentiate angles: that of
@@ -102,7 +103,7 @@ def validate(
     fit: Fit,
     session: Session,
     experiments: str | Sequence[str] | None = None,
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = lambda message: None,
 ) -> Validation:
     """Score a fit on the trials of the recipe's validation experiments, or on those of `experiments`, one or more.
 
