@@ -204,7 +204,9 @@ def _recorded(problem: Problem, e: str, c: str) -> bool:
     return any(v is not None and bool(np.isfinite(v).any()) for v in values)
 
 
-def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit):
+def candidates_of(
+    problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit
+) -> tuple[Candidate, ...]:
     """All candidates, most probable first.
 
     Values and held-out share of a member of the chosen set are those in the set, of others those alone on top of the

@@ -55,7 +55,7 @@ class Members:
     # The part from the noise is widened as much as the template's is (`intervals`); infinite where the template's are.
     std: Float[np.ndarray, "S P"]
     failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
-    steps: np.ndarray  # linearisations of each member, summed over stages
+    steps: Int[np.ndarray, " S"]  # linearisations of each member, summed over stages
     template: Fit
 
     def __repr__(self) -> str:

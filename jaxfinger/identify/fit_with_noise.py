@@ -3,7 +3,7 @@
 from functools import partial
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfinger.experiments import Stack
 from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_STD, SIGNAL_WINDOW, Noise, estimate
@@ -17,7 +17,7 @@ from jaxfinger.model import Model
 
 def estimate_with_noise(
     model: Model,
-    free: np.ndarray,
+    free: Int[np.ndarray, " p"],
     stacks: dict[str, Stack],
     reads: dict[str, tuple[str, ...]],
     known: dict[tuple[str, str], Noise],

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxfinger.data import Session
 from jaxfinger.experiments import Stack, predict, predict_compiled
@@ -62,7 +63,7 @@ def force_slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list
     ]
 
 
-def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
+def _slope_std(f: Float[np.ndarray, " T"], errors: Float[np.ndarray, " T"], weights: Float[np.ndarray, " T"]) -> float:
     """Standard deviation of a slope, from the scatter of the means of holds about the model's curve.
 
     NaN for two holds, through which a line goes without scatter.

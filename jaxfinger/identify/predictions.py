@@ -31,7 +31,7 @@ def predict_session(
     session: Session,
     names: str | Sequence[str] | None = None,
     progress: Progress = lambda message: None,
-) -> dict[str, dict[str, np.ndarray]]:
+) -> dict[str, dict[str, Float[np.ndarray, "_N _columns"]]]:
     """Predict the channels of the named trials, one or more: `{trial: {channel: (N, columns)}}`, in SI units.
 
     `names`: by default all trials.
@@ -131,7 +131,9 @@ def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Ses
     return channels
 
 
-def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
+def simulate_trials(
+    models: Sequence[Model], session: Session, stack: Stack
+) -> dict[str, dict[str, Float[np.ndarray, "_N m"]]]:
     """Simulate q, rad, of each VD.3 trial of a full-rate stack from its first sample under the measured tension.
 
     `models`: one for each trial, of one structure.

@@ -207,7 +207,7 @@ def solve(
     )
 
 
-def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior | None) -> float:
+def total_cost(model: Model, solution: Solution, free: Int[np.ndarray, " p"], prior: Prior | None) -> float:
     """Cost that a fit minimises, the prior included."""
     return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
 
@@ -372,8 +372,11 @@ def visible(A: Float[np.ndarray, "k p"]) -> tuple[Float[np.ndarray, "p v"], Floa
 
 
 def bounded_least_squares(
-    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf
-) -> np.ndarray:
+    A: Float[np.ndarray, "N p"],
+    b: Float[np.ndarray, " N"],
+    low: Float[np.ndarray, " p"],
+    high: Float[np.ndarray, " p"] | float = np.inf,
+) -> Float[np.ndarray, " p"]:
     """Minimum δ of ‖A δ + b‖ over low ≤ δ ≤ high, by `gauss_newton.bounded_step`; bounds that exclude 0 move to 0."""
     p = A.shape[1]
     room = _room(p)

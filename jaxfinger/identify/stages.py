@@ -185,7 +185,12 @@ def name_doubtful(
 
 
 def report_of(
-    name: str, solution: Solution, free: np.ndarray, trials: tuple[str, ...], warnings: list[str], message: str = ""
+    name: str,
+    solution: Solution,
+    free: Int[np.ndarray, " p"],
+    trials: tuple[str, ...],
+    warnings: list[str],
+    message: str = "",
 ) -> StageReport:
     """Report of a stage from its solution; `message` is used where the search converged."""
     return StageReport(
@@ -200,7 +205,7 @@ def report_of(
     )
 
 
-def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Coverage) -> np.ndarray:
+def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Coverage) -> Int[np.ndarray, " p"]:
     """Positions of the parameters that a stage estimates: those of its groups that its trials can determine."""
     groups = set(stage.frees) & free_groups(fit.recipe)
     prior_groups = {"mass", "com"} if fit.recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
