@@ -39,8 +39,9 @@ from jaxfinger.data import FingerDescription, Session, read_session, write_sessi
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import STEP_TOLERANCE, Source, Tangents, linearise_each, solve, stacked
-from jaxfinger.identify.stages import STAGES, sources_of
+from jaxfinger.identify.solve import STEP_TOLERANCE, Tangents, linearise_each, solve, stacked
+from jaxfinger.identify.sources import Source, sources_of
+from jaxfinger.identify.stages import STAGES
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Finger, Model, rigid_body
 from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model

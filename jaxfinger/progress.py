@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+Progress = Callable[[str], None]  # takes the name of the step that begins, which may be a `Step`
+
 
 class Step(str):
     """Name of a step that begins, with the share of the whole work done before it.

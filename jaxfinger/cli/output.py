@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +18,7 @@ from rich.text import Text
 
 from jaxfinger.errors import UserError
 from jaxfinger.jsonable import jsonable
-from jaxfinger.progress import Step
+from jaxfinger.progress import Progress, Step
 
 if TYPE_CHECKING:
     from jaxfinger.data import Session
@@ -32,7 +32,7 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 @contextmanager
-def progress(title: str) -> Iterator[Callable[[str], None]]:
+def progress(title: str) -> Iterator[Progress]:
     """Show progress on stderr: one line that is renewed, or a line a step where stderr is no terminal.
 
     The context is a function that takes the name of the step that begins. Beside it stand the share done and an

@@ -22,7 +22,8 @@ from jaxfinger.identify.fit import StageReport
 from jaxfinger.identify.intervals import evidence, laplace
 from jaxfinger.identify.parameters import describe, effect_parameter, ravel, units_at
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, residuals_each, solve, white_tangents
+from jaxfinger.identify.solve import Solution, solve
+from jaxfinger.identify.sources import Source, residuals_each, white_tangents
 from jaxfinger.model import Model
 
 WITH_EFFECTS = "with the effects of the diagnosis"
@@ -146,14 +147,16 @@ def _moving(effect: CatalogueEffect) -> CatalogueEffect:
     return replace(effect, **{n: jnp.asarray(n not in stays, dtype=float) for n in effect.values()})
 
 
-def limits(model: Model, free: np.ndarray, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of the free parameters (p,): those of the effects, and none for nominal parameters."""
+def limits(
+    model: Model, free: Int[np.ndarray, " p"], scales: Scales
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Lower and upper bounds of the free parameters: those of the effects, and none for nominal parameters."""
     of_effect = np.array([p.group == "effects" for p in describe(model)])[free]
     low, high = (np.asarray(ravel(_on_effects(partial(_limit, side, scales), model)))[free] for side in (0, 1))
     return np.where(of_effect, low, -np.inf), np.where(of_effect, high, np.inf)
 
 
-def without_shapes(model: Model, free: np.ndarray) -> np.ndarray:
+def without_shapes(model: Model, free: Int[np.ndarray, " p"]) -> Int[np.ndarray, " q"]:
     """Positions of the free parameters without the effects' shapes."""
     shapes = np.asarray(ravel(_on_effects(_shapes, model))) > 0.0
     of_effect = np.array([p.group == "effects" for p in describe(model)])
@@ -194,7 +197,11 @@ def _seeing_effects(problem: Problem, source: Source, effects: tuple[CatalogueEf
 
 
 def _covariance(
-    problem: Problem, r: np.ndarray, J: np.ndarray, root: np.ndarray, chosen: SearchState | None = None
+    problem: Problem,
+    r: Float[np.ndarray, " N"],
+    J: Float[np.ndarray, "N p"],
+    root: Float[np.ndarray, "k p"],
+    chosen: SearchState | None = None,
 ) -> Float[np.ndarray, "p p"]:
     """Laplace covariance (JᵀJ + prior precision)⁻¹, with causes in the weights of the formula.
 

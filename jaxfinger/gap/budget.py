@@ -29,6 +29,11 @@ DRAWS = 400  # Draws of the bootstrap over trials: the quantiles of a 95 % inter
 MIN_GAP_EVIDENCE = 6.0
 # Shares are relative to a gap of at least 0.05 in mean square of the noise. Below that, noise divides noise.
 MIN_RELATIVE_GAP = 0.05
+# Likewise for the rows of all columns together. They are more, and their mean square is known better.
+MIN_RELATIVE_GAP_OF_ALL = 0.01
+# Relative. Keeps products invertible where the seen trials do not show a column, or do not tell it from others: the
+# share of FOLD_PRIOR, which is relative to the largest column, is less than rounding there.
+RIDGE = 1e-11
 
 
 class Cell(NamedTuple):
@@ -188,7 +193,9 @@ def _products(
     return cells, np.array(null), np.array(full)
 
 
-def _weights(cells: list[Cell], full, seen: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+def _weights(
+    cells: list[Cell], full: Float[np.ndarray, "cells f f"], seen: Int[np.ndarray, " s"]
+) -> Float[np.ndarray, " s"]:
     """Weight of each seen cell: the inverse of its column's mean square with all causes, at most 1."""
     column = np.array([cells[i].column for i in seen], int)
     n = np.bincount(column, [cells[i].rows for i in seen])
@@ -196,12 +203,18 @@ def _weights(cells: list[Cell], full, seen: Int[np.ndarray, " s"]) -> Float[np.n
     return (np.maximum(n, 1.0) / np.maximum(np.maximum(e, n), 1.0))[column]
 
 
-def _joint(seen, weight, state: SearchState, without: int | None = None) -> Float[np.ndarray, " f"]:
+def _joint(
+    products: Float[np.ndarray, "s f f"],
+    weight: Float[np.ndarray, " s"],
+    state: SearchState,
+    without: int | None = None,
+) -> Float[np.ndarray, " f"]:
     """Coefficients of [residual, J, slopes, changes] after a refit of J and slopes, without one cause if asked.
 
-    A cause is taken out where its change, which the residual lacks, comes back with coefficient 1.
+    `products`: of the rows in each seen cell. A cause is taken out where its change, which the residual lacks, comes
+    back with coefficient 1.
     """
-    k, m, H = state.problem.J.shape[1], len(state.coordinates), np.tensordot(weight, seen, 1)
+    k, m, H = state.problem.J.shape[1], len(state.coordinates), np.tensordot(weight, products, 1)
     x = np.zeros(len(H))
     x[0] = 1.0
     if without is not None:
@@ -210,25 +223,26 @@ def _joint(seen, weight, state: SearchState, without: int | None = None) -> Floa
     return _solved(H, prior_products(state.problem, m), x, [*range(1, 1 + k), *moves])
 
 
-def _nominal(H, problem: Problem, x: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+def _nominal(H: Float[np.ndarray, "f f"], problem: Problem, x: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
     """Coefficients x with those of J refitted with equal weights for all rows, the others unchanged."""
     k, x = problem.J.shape[1], x.copy()
     x[1 : 1 + k] = 0.0
     return _solved(H, prior_products(problem, 0), x, list(range(1, 1 + k)))
 
 
-def _solved(H, prior, x, free: list[int]) -> np.ndarray:
-    """Coefficients x with the free ones at the least squares. A weak ridge keeps unseen ones near zero."""
+def _solved(
+    H: Float[np.ndarray, "f f"], prior: Float[np.ndarray, "d d"], x: Float[np.ndarray, " f"], free: list[int]
+) -> Float[np.ndarray, " f"]:
+    """Coefficients x with the free ones at the least squares, and near zero where H does not show them."""
     d = len(prior)
     A = H.copy()
     A[:d, :d] += prior
     scale = np.sqrt(np.maximum(np.diag(H)[free], 1e-300))
-    M = A[np.ix_(free, free)] / np.outer(scale, scale) + FOLD_PRIOR**2 / max(float(np.max(scale**2)), 1.0) * np.eye(
-        len(free)
-    )
+    eye = np.eye(len(free))
+    M = A[np.ix_(free, free)] / np.outer(scale, scale) + FOLD_PRIOR**2 / max(float(np.max(scale**2)), 1.0) * eye
     out = x.copy()
     out[free] = 0.0
-    out[free] = np.linalg.solve(M + 1e-11 * np.eye(len(free)), -(A[free] @ out) / scale) / scale
+    out[free] = np.linalg.solve(M + RIDGE * eye, -(A[free] @ out) / scale) / scale
     return out
 
 
@@ -256,5 +270,5 @@ def held_out_gains(problem: Problem, members: list[Float[np.ndarray, "_k N"]]) -
             amplitudes = np.linalg.lstsq(fitted[a:b, a:b], fitted[a:b, 0], rcond=1e-10)[0]
             both, parts = np.concatenate([[1.0], -amplitudes]), [0, *range(a, b)]
             with_member[i] += float(both @ left[np.ix_(parts, parts)] @ both)
-    gap = alone - problem.r.size
-    return [float(np.clip((alone - x) / max(gap, 0.01 * problem.r.size), 0.0, 1.0)) for x in with_member]
+    gap = max(alone - problem.r.size, MIN_RELATIVE_GAP_OF_ALL * problem.r.size)
+    return [float(np.clip((alone - x) / gap, 0.0, 1.0)) for x in with_member]

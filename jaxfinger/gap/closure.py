@@ -4,7 +4,7 @@ Each third of the trials is held out in turn, stratified by experiment, joint an
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfinger.data.schema import CHANNELS, channel_units
 from jaxfinger.effects import Scales
@@ -60,7 +60,10 @@ def closures(problem: Problem, augmented: Fitted | None, forward: bool = True) -
 
 
 def _before_and_after(
-    problem: Problem, augmented: Fitted | None, training: np.ndarray, seen: dict[str, np.ndarray]
+    problem: Problem,
+    augmented: Fitted | None,
+    training: Bool[np.ndarray, " N"],
+    seen: dict[str, Bool[np.ndarray, "_B _T"]],
 ) -> tuple[tuple[Model, Residuals], tuple[Model, Residuals]]:
     """Models before and after, refitted to the training rows (the samples `seen`), each with its residuals.
 
@@ -68,7 +71,9 @@ def _before_and_after(
     better is taken, and neither if the model before fits them best.
     """
 
-    def refit(model: Model, free: np.ndarray, J: np.ndarray, r: np.ndarray) -> Model:
+    def refit(
+        model: Model, free: Int[np.ndarray, " p"], J: Float[np.ndarray, "N p"], r: Float[np.ndarray, " N"]
+    ) -> Model:
         return _refit(model, free, J, r, training, problem.prior, problem.scales)
 
     model = problem.simulator or refit(problem.nominal, problem.free, problem.J, problem.r)
@@ -85,7 +90,9 @@ def _before_and_after(
     return before, best
 
 
-def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model]]):
+def _forward(
+    problem: Problem, fold: Int[np.ndarray, "B T"], models: list[tuple[Model, Model]]
+) -> tuple[list[tuple[float, ...]], bool]:
     """Mean squares of simulated q before, after and of the noise, with the number of samples; and whether any diverged.
 
     Each trial is simulated by the models (before, after) of the fold that holds out its first sample. Its noise is the
@@ -107,6 +114,7 @@ def _forward(problem: Problem, fold: np.ndarray, models: list[tuple[Model, Model
     for name in trials:
         q = session[name].q
         motion = float(np.mean((q - q.mean(axis=0)) ** 2))
+        # An error of half a turn is that of a simulation that has diverged.
         errors = [np.fmin(np.abs(q - np.nan_to_num(p[name]["q"], nan=np.inf)), np.pi) for p in (old, new)]
         squares = [float(np.nanmean(x**2)) for x in errors]
         diverged |= squares[1] > motion  # A finger that stands still would be nearer.
@@ -143,8 +151,8 @@ def _refit(model: Model, free, J, r, training, prior: Prior, scales: Scales) -> 
     return Free.at(model, free).set(model, theta + delta)
 
 
-def _misfit(problem: Problem, residuals: Residuals, keep: dict[str, np.ndarray]) -> float:
-    """Sum of squares, in squared standard deviations of the noise, over the samples where `keep` (B, T) is true."""
+def _misfit(problem: Problem, residuals: Residuals, keep: dict[str, Bool[np.ndarray, "_B _T"]]) -> float:
+    """Sum of squares, in squared standard deviations of the noise, over the samples where `keep` is true."""
     total = 0.0
     for (e, c), x in residuals.items():
         mask = np.asarray(problem.stacks[e].batch.mask[c]) * keep[e]

@@ -46,8 +46,7 @@ class Costs:
     def odds(self, keys: Iterable[CauseKey]) -> float:
         """Log prior odds against these effects and sites: Σ_effects log E + Σ_causes log S_effect.
 
-        A term of the nominal model that the recipe leaves out costs no log E, since it is as likely at
-        work as not.
+        A term of the nominal model that the recipe leaves out costs no log E, since it is as likely at work as not.
         """
         keys = list(keys)
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)

@@ -52,8 +52,8 @@ from jaxfinger.gap.verdict import confirmed, consistent_with, verdict_of
 from jaxfinger.gap.where import where
 from jaxfinger.identify import Fit, Recipe
 from jaxfinger.identify.recipe import checked as checked_recipe
-from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
+from jaxfinger.progress import Progress
 
 COARSE = 2  # A quick diagnosis averages over twice as many samples, which halves the rows.
 

@@ -11,8 +11,8 @@ FOLDS = 3  # Every refit then has two thirds of the trials.
 FOLD_PRIOR = 0.05
 
 
-def folds(problem: Problem) -> dict[str, np.ndarray]:
-    """Fold of every sample, (B, T) by experiment.
+def folds(problem: Problem) -> dict[str, Int[np.ndarray, "_B _T"]]:
+    """Fold of every sample, by experiment.
 
     Trials of one experiment, joint and tendon are dealt to the folds as wholes. One that stands alone is divided into
     2 FOLDS contiguous blocks of equal duration. Trials of which no sample counts, as where another simulator does not

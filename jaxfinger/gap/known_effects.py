@@ -17,8 +17,8 @@ from jaxfinger.gap.sets import Search
 from jaxfinger.gap.signature_table import table_of
 from jaxfinger.gap.signatures import Variant, catalogue_for, variants
 from jaxfinger.identify import Fit, Recipe
-from jaxfinger.identify.stages import Progress
 from jaxfinger.model import Finger
+from jaxfinger.progress import Progress
 
 
 @one_blas_thread

@@ -23,8 +23,10 @@ class MergedTrials:
     x: list[Motion]  # one for each block
     contact: list[Array | None]  # `contact_map` of each block for the fingertip force, None for other channels
 
-    def merged(self, arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Float[Array, "columns B T"]]:
-        """Arrays (columns, trials, time) by experiment and channel, merged into the blocks of `x`."""
+    def merged(
+        self, arrays: Mapping[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]
+    ) -> list[Float[Array, "columns B T"]]:
+        """Arrays by experiment and channel, merged into the blocks of `x`."""
         return _merged([arrays[e, self.channel] for e in self.trials])
 
     def of(self, experiments: Sequence[str]) -> list[int]:

@@ -40,7 +40,7 @@ from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.smooth_laws import SmoothPart
 from jaxfinger.identify import Fit
 from jaxfinger.identify.parameters import Parameter, describe, effect_parameter, ravel, units_at
-from jaxfinger.identify.stages import Progress
+from jaxfinger.progress import Progress
 
 # The thresholds of this module decide what a report mentions, and no verdict.
 # Share of a signature's energy that the nominal parameters imitate, from which a cause is listed as absorbed: of what
@@ -204,7 +204,9 @@ def _recorded(problem: Problem, e: str, c: str) -> bool:
     return any(v is not None and bool(np.isfinite(v).any()) for v in values)
 
 
-def candidates_of(problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit):
+def candidates_of(
+    problem: Problem, search: Search, chosen: SearchState, found: Posterior, shares: Budget, fit: Fit
+) -> tuple[Candidate, ...]:
     """All candidates, most probable first.
 
     Values and held-out share of a member of the chosen set are those in the set, of others those alone on top of the

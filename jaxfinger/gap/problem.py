@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import block_diag, csr_array
 
 from jaxfinger.compilation import quick_jit
@@ -26,25 +26,21 @@ from jaxfinger.gap.merged_trials import MergedTrials, merged_trials
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Fit, Recipe, identify
 from jaxfinger.identify.dead_zone import clear_of_dead_zones
+from jaxfinger.identify.fit_with_noise import residuals_for_noise
 from jaxfinger.identify.intervals import stretches
 from jaxfinger.identify.linearise import NO_REVERSALS, White
 from jaxfinger.identify.noise import Noise, estimate, history, without_recurring_laws
+from jaxfinger.identify.nominal import cad_prior, free_groups, nominal_model
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.reversals import torque_changes, with_reversals
-from jaxfinger.identify.solve import ROUGH_TOLERANCE, Source, solve, white_tangents
-from jaxfinger.identify.stages import (
-    Progress,
-    cad_prior,
-    free_groups,
-    nominal_model,
-    residuals_for_noise,
-    sources_of,
-)
+from jaxfinger.identify.solve import ROUGH_TOLERANCE, solve
+from jaxfinger.identify.sources import Source, sources_of, white_tangents
 from jaxfinger.identify.start import start_values
 from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of
 from jaxfinger.model import Model, Terms, terms_without_effects
+from jaxfinger.progress import Progress
 
 MAX_ROUNDS = 8  # of refits to all trials, each with the noise that the one before leaves
 NOISE_CHANGE = 0.2  # relative, of a channel's standard deviation: less changes no interval by as much as a tenth
@@ -57,12 +53,12 @@ class Rows:
 
     experiment: str
     start: int  # position of the first row in the vector of all experiments' rows
-    keep: np.ndarray  # (rows,) positions in the flattened (B, columns of all channels, T) block of white residuals
-    channel: np.ndarray  # (rows,) index of the channel among the experiment's
-    column: np.ndarray  # (rows,) index of the joint, tendon or axis
-    trial: np.ndarray  # (rows,) index of the trial in the stack
-    time: np.ndarray  # (rows,) index of the sample
-    history: np.ndarray  # (rows,) number of preceding samples that the whitening filter reads
+    keep: Int[np.ndarray, " rows"]  # positions in the flattened block (B, columns of all channels, T) of white rows
+    channel: Int[np.ndarray, " rows"]  # index of the channel among the experiment's
+    column: Int[np.ndarray, " rows"]  # index of the joint, tendon or axis
+    trial: Int[np.ndarray, " rows"]  # index of the trial in the stack
+    time: Int[np.ndarray, " rows"]  # index of the sample
+    history: Int[np.ndarray, " rows"]  # number of preceding samples that the whitening filter reads
     reversals: dict[str, csr_array]  # (rows, rows) C of `identify.reversals`, of channels that have any
 
     @property
@@ -82,14 +78,14 @@ class Problem:
     stacks: dict[str, Stack]
     noise: Noises
     nominal: Model
-    free: np.ndarray  # positions of the free nominal parameters in the flat vector
+    free: Int[np.ndarray, " p"]  # positions of the free nominal parameters in the flat vector
     rows: dict[str, Rows]
     groups: list[MergedTrials]  # the same trials, merged by what predicts them
     r: Float[np.ndarray, " N"]  # whitened residuals of the nominal model
     J: Float[np.ndarray, "N p"]  # whitened ∂ŷ/∂θ
     root: Float[np.ndarray, "k p"]  # square root of the prior precision of the free parameters
     offset: Float[np.ndarray, " k"]  # root (θ̂ − prior mean)
-    predicted: dict[tuple[str, str], np.ndarray]  # ŷ of the nominal model, (columns, B, T)
+    predicted: dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]  # ŷ of the nominal model
     fit: Fit  # the staged fit
     sources: dict[str, Source]
     prior: Prior
@@ -97,8 +93,8 @@ class Problem:
     simulator: Model | None = None  # the emulator, where another simulator's predictions are diagnosed
 
     @property
-    def trial_of_row(self) -> np.ndarray:
-        """(N,) number of each row's trial, counted over all experiments."""
+    def trial_of_row(self) -> Int[np.ndarray, " N"]:
+        """Number of each row's trial, counted over all experiments."""
         out, first = np.empty(self.r.size, int), 0
         for rows in self.rows.values():
             out[rows.start : rows.start + rows.size] = rows.trial + first
@@ -106,14 +102,14 @@ class Problem:
         return out
 
     @property
-    def column_of_row(self) -> np.ndarray:
-        """(N,) number of each row's column, counted over all channels of all experiments."""
+    def column_of_row(self) -> Int[np.ndarray, " N"]:
+        """Number of each row's column, counted over all channels of all experiments."""
         kinds = [np.stack([np.full(r.size, e), r.channel, r.column]) for e, r in enumerate(self.rows.values())]
         return np.unique(np.concatenate(kinds, axis=1), axis=1, return_inverse=True)[1]
 
     @property
-    def stretch_of_row(self) -> np.ndarray:
-        """(N,) number of the stretch of a trial to which each row belongs (`intervals.stretches`)."""
+    def stretch_of_row(self) -> Int[np.ndarray, " N"]:
+        """Number of the stretch of a trial to which each row belongs (`intervals.stretches`)."""
         times = []
         for e, rows in self.rows.items():
             source = self.sources[e]
@@ -230,7 +226,7 @@ def _refitted_to_all(
     reads = {e: stack.experiment.channels for e, stack in stacks.items()}
     changes = {e: torque_changes(stack, fit.model) for e, stack in stacks.items()}
 
-    def prior_on(free: np.ndarray) -> Prior:
+    def prior_on(free: Int[np.ndarray, " _p"]) -> Prior:
         if against is None:
             return cad_prior(session, fit.recipe, parameters, free)
         return prior_of(np.asarray(ravel(against.model)), against.covariance, free)
@@ -364,9 +360,13 @@ def _layouts(sources: dict[str, Source]) -> dict[str, Rows]:
 
 
 def assemble(
-    white: Mapping[str, White], sources: dict[str, Source], rows: dict[str, Rows], free: np.ndarray, size: int
+    white: Mapping[str, White],
+    sources: dict[str, Source],
+    rows: dict[str, Rows],
+    free: Int[np.ndarray, " p"],
+    size: int,
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N p"]]:
-    """Stack white residuals (N,) and the derivatives of white predictions by the free parameters (N, p).
+    """Stack white residuals, and the derivatives of white predictions by the free parameters.
 
     `size` is the length of the flat vector of all parameters, of which `free` are positions.
     """
@@ -402,11 +402,11 @@ def _settled(before: Noises, now: Noises) -> bool:
 def _with_unfitted(
     model: Model,
     groups: set[str],
-    free: np.ndarray,
+    free: Int[np.ndarray, " p"],
     sources: dict[str, Source],
     parameters: list[Parameter],
     coverage: Coverage,
-) -> tuple[Model, np.ndarray]:
+) -> tuple[Model, Int[np.ndarray, " q"]]:
     """Add to `free` the other parameters of `groups` that some trial shows; return model and positions.
 
     A stage is skipped where its experiment is missing: without ID.3-dynamic none estimates damping, though VD.3 shows

@@ -17,7 +17,7 @@ from jaxfinger.gap.by_column import ByColumn
 from jaxfinger.gap.columns import Columns
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signatures import CHUNK, Signatures, Variant, own, placed
-from jaxfinger.identify.stages import Progress
+from jaxfinger.progress import Progress
 
 MIN_PERIOD = 20.0  # s. Drifts take minutes; shorter periods are those of the motion itself.
 # Limits memory. In sessions longer than 50 minutes the shortest period therefore grows with the session.

@@ -34,7 +34,7 @@ from jaxfinger.gap.formula import Evidence, LinearFit, LinearModel, Weights, une
 from jaxfinger.gap.problem import Problem
 from jaxfinger.gap.signature_table import Offer, SignatureTable
 from jaxfinger.gap.signatures import Variant
-from jaxfinger.identify.stages import Progress
+from jaxfinger.progress import Progress
 
 SHORT_LIST = 12  # offers that are compared with settled weights: a few for each of the likeliest causes
 MAX_PER_CHOICE = 2  # of the short list, for one cause and one choice of its fixed shapes
@@ -351,7 +351,7 @@ class Search:
         state: SearchState,
         without: int | None,
         offer: Offer | None = None,
-        amplitudes: Sequence[float] | np.ndarray = (),
+        amplitudes: Sequence[float] | Float[np.ndarray, " k"] = (),
         weights: Weights | None = None,
     ) -> SearchState:
         """Fit a set with an offer added, or without one cause, or both, from where the set is.
@@ -367,7 +367,9 @@ class Search:
             starts += self._in_own_units(offer, amplitudes)
         return self._fit(state.problem, variants, starts, weights or state.linear_fit.weights)
 
-    def _in_own_units(self, offer: Offer, amplitudes: Sequence[float] | np.ndarray) -> list[dict[str, float]]:
+    def _in_own_units(
+        self, offer: Offer, amplitudes: Sequence[float] | Float[np.ndarray, " k"]
+    ) -> list[dict[str, float]]:
         """Amplitudes of an offer by name for each of its variants; zero where the trials see nothing of one."""
         of_row = {i: float(a) for i, a in zip(offer.rows.tolist(), amplitudes, strict=True)}
         return [

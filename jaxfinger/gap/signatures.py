@@ -12,7 +12,7 @@ from itertools import product
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.effects import CATALOGUE, CatalogueEffect, Changed, Scales, Site, changes, file_of, nominal_terms
@@ -52,7 +52,7 @@ class Variant:
         """Replace the values of some shapes."""
         return replace(self, shape=tuple((dict(self.shape) | values).items()))
 
-    def at(self, finger, amplitudes: dict[str, float]) -> CatalogueEffect:
+    def at(self, finger: Finger, amplitudes: dict[str, float]) -> CatalogueEffect:
         """Make the effect with these amplitudes, in their own units."""
         return self.effect.at(finger, self.site, **dict(self.shape), **amplitudes)
 
@@ -82,7 +82,7 @@ def changes_of(fit: Fit) -> dict[str, type[CatalogueEffect]]:
     }
 
 
-def variants(effects: Mapping[str, type[CatalogueEffect]], finger, scales: Scales) -> list[Variant]:
+def variants(effects: Mapping[str, type[CatalogueEffect]], finger: Finger, scales: Scales) -> list[Variant]:
     """Variants of every effect: all its sites, shapes worth trying, and sizes."""
     return [
         Variant(effect, site, tuple(shape.items()), size, scales=scales)
@@ -243,7 +243,11 @@ def _refuse_no_numbers(
 
 
 def whitened(
-    raw: Float[np.ndarray, "members columns B T"], problem: Problem, rows: Rows, of_channel: np.ndarray, channel: str
+    raw: Float[np.ndarray, "members columns B T"],
+    problem: Problem,
+    rows: Rows,
+    of_channel: Int[np.ndarray, " rows"],
+    channel: str,
 ) -> Float[np.ndarray, "members rows"]:
     """Whiten changes of a channel as its residuals are (`noise.whiten`), in its rows `of_channel` of an experiment.
 

@@ -21,11 +21,13 @@ from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError, listed
 from jaxfinger.experiments import Stack, demean, predict_compiled, prepare
 from jaxfinger.identify import Recipe
+from jaxfinger.identify.fit_with_noise import first_noise
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.nominal import GROUP_OF_TERM, free_groups, nominal_model
 from jaxfinger.identify.parameters import Free, describe
 from jaxfinger.identify.solve import solve
-from jaxfinger.identify.stages import STAGES, first_noise, sources_of
+from jaxfinger.identify.sources import sources_of
+from jaxfinger.identify.stages import STAGES
 from jaxfinger.identify.start import start_values
 from jaxfinger.model import Model
 

@@ -40,7 +40,7 @@ from jaxfinger.identify.resample import (
     variances,
 )
 from jaxfinger.identify.solve import KINK_TOLERANCE, MAX_STEPS, STEP_TOLERANCE, parameter_bounds
-from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.sources import sources_of
 from jaxfinger.model import Model
 
 SESSIONS_AT_ONCE = 10  # in one call, so that the next sessions are read and filtered while the device fits these
@@ -55,7 +55,7 @@ class Members:
     # The part from the noise is widened as much as the template's is (`intervals`); infinite where the template's are.
     std: Float[np.ndarray, "S P"]
     failed: Bool[np.ndarray, " S"]  # did not converge, or its trials do not determine all parameters
-    steps: np.ndarray  # linearisations of each member, summed over stages
+    steps: Int[np.ndarray, " S"]  # linearisations of each member, summed over stages
     template: Fit
 
     def __repr__(self) -> str:

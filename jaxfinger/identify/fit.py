@@ -1,5 +1,6 @@
 """The result of an identification."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from html import escape
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxfinger.data import Session, data_hash, trial_hash
 from jaxfinger.identify.noise import Noise
@@ -44,10 +46,10 @@ class Fit:
     """
 
     model: Model
-    # (P, P); zero for parameters that are given. The diagonal is infinite for those that are undetermined, or that the
+    # Zero for parameters that are given. The diagonal is infinite for those that are undetermined, or that the
     # recipe has and no stage has estimated.
-    covariance: np.ndarray
-    estimated: np.ndarray  # positions of the estimated parameters in the flat vector
+    covariance: Float[np.ndarray, "P P"]
+    estimated: Int[np.ndarray, " p"]  # positions of the estimated parameters in the flat vector
     recipe: Recipe
     noise: dict[tuple[str, str], Noise] = field(default_factory=dict)  # by experiment and channel
     stages: tuple[StageReport, ...] = ()
@@ -90,7 +92,7 @@ class Fit:
         return replace(self, data=data, data_hash=" ".join(filter(None, (self.data_hash, *new))))
 
     @property
-    def std(self) -> np.ndarray:
+    def std(self) -> Float[np.ndarray, " P"]:
         """Standard deviation of every entry of the flat vector, in SI units."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
@@ -124,7 +126,9 @@ class Fit:
             for i in self.estimated
         )
 
-    def function(self, f) -> tuple[np.ndarray, np.ndarray]:
+    def function(
+        self, f: Callable[[Model], Float[Array, "*k"]]
+    ) -> tuple[Float[np.ndarray, "*k"], Float[np.ndarray, "*k"]]:
         """Value and standard deviation of a function `f` of the model that returns an array, by the delta method.
 
         The standard deviation is infinite where the value depends on an undetermined parameter. A program is compiled

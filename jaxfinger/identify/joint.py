@@ -19,6 +19,7 @@ from jaxfinger.data import Session
 from jaxfinger.errors import UserError, require
 from jaxfinger.experiments import EXPERIMENTS, not_judged
 from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.fit_with_noise import estimate_with_noise
 from jaxfinger.identify.nominal import cad_covariance, cad_prior, free_groups
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import model_for
@@ -26,11 +27,13 @@ from jaxfinger.identify.prior import Prior, prior_of
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.shooting import AHEAD, Shooting, shooting
-from jaxfinger.identify.solve import Solution, Source, solve
-from jaxfinger.identify.stages import Progress, estimate_with_noise, name_doubtful, report_of, sources_of, total_cost
+from jaxfinger.identify.solve import Solution, solve, total_cost
+from jaxfinger.identify.sources import Source, sources_of
+from jaxfinger.identify.stages import name_doubtful, report_of
 from jaxfinger.identify.start import start_values
 from jaxfinger.identify.trial_coverage import can_determine, coverage_of
 from jaxfinger.model import Model
+from jaxfinger.progress import Progress
 
 JOINT = "joint"  # name of the stage
 # χ² per row above which another start is tried. Noise alone gives 1 to a few percent, as a fit reads thousands of rows.

@@ -77,7 +77,7 @@ class White:
 
 @dataclass(frozen=True)
 class Linearised(White):
-    """The same, compressed."""
+    """White residuals and Jacobian of one experiment, compressed trial by trial."""
 
     factor: Float[np.ndarray, "B k p+1"]  # triangular factor of [J r] under Huber's cost
 
@@ -201,7 +201,9 @@ def tangent(
     return Tangent(*_by_blocks(lambda block: _tangent(model, free, block, channels, wanted), model, batch))
 
 
-def residuals_by_tangent(model: Model, free: Free, batch: Batch, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
+def residuals_by_tangent(
+    model: Model, free: Free, batch: Batch, channels: tuple[str, ...]
+) -> dict[str, Float[np.ndarray, "_columns B T"]]:
     """Residuals as of `residuals_of`, computed by the program of `tangent`, so that none is compiled for them alone."""
     if batch.x.simulated:
         return residuals_of(model, batch, channels)

@@ -343,6 +343,7 @@ def _autoregression(series: Series) -> tuple[float, float, np.ndarray]:
     if not series or not any(m.any() for _, m, _ in series):
         return 1.0, 1.0, np.zeros(ORDER)
     values = np.concatenate([e[m] for e, m, _ in series])
+    # One normal value of 16 000 lies beyond four standard deviations; outliers do, and would dominate the squares.
     limit = 4.0 * STD_PER_MAD * np.median(np.abs(values)) + 1e-300
     clipped = [(np.clip(e, -limit, limit), m, lost) for e, m, lost in series]
     covariance = np.array([_lagged(clipped, k) for k in range(ORDER + 1)])

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxfinger.data import Session
 from jaxfinger.identify.parameters import Parameter, describe, ravel
@@ -42,8 +43,10 @@ def nominal_model(session: Session, recipe: Recipe) -> Model:
     return model
 
 
-def _by_exponents(model: Model, known: np.ndarray, parameters: list[Parameter]) -> np.ndarray:
-    """Flat coefficients of the moment arms, from polynomials `known` (n, m, k) of single joints; else zero."""
+def _by_exponents(
+    model: Model, known: Float[np.ndarray, "n m k"], parameters: list[Parameter]
+) -> Float[np.ndarray, " c"]:
+    """Flat coefficients of the moment arms, from polynomials `known` of single joints; else zero."""
     joints, tendons = model.finger.joint_names, model.finger.tendon_names
     values = np.zeros(model.moment_arm.coefficients.size)
     for at, p in enumerate(p for p in parameters if p.group == "moment_arm"):
@@ -57,7 +60,7 @@ def free_groups(recipe: Recipe) -> set[str]:
     return {"moment_arm"} | {GROUP_OF_TERM[t] for t in recipe.model.terms if t in GROUP_OF_TERM}
 
 
-def covariance_before(session: Session, recipe: Recipe, parameters: list[Parameter]) -> np.ndarray:
+def covariance_before(session: Session, recipe: Recipe, parameters: list[Parameter]) -> Float[np.ndarray, "P P"]:
     """Covariance of the flat vector before any fit: `cad_covariance`, infinite for what nothing tells yet.
 
     That is a parameter of the recipe's terms, or of a moment arm, of which the description gives no value. It stands at
@@ -77,7 +80,7 @@ def covariance_before(session: Session, recipe: Recipe, parameters: list[Paramet
     return covariance
 
 
-def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
+def cad_covariance(session: Session, parameters: list[Parameter]) -> Float[np.ndarray, "P P"]:
     """Covariance of what the finger's description gives.
 
     It is diagonal: the description's standard deviations of masses, centres of mass, rotors and excursions, else zero.
@@ -95,7 +98,7 @@ def cad_covariance(session: Session, parameters: list[Parameter]) -> np.ndarray:
     return np.diag(variance)
 
 
-def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], free: np.ndarray) -> Prior:
+def cad_prior(session: Session, recipe: Recipe, parameters: list[Parameter], free: Int[np.ndarray, " p"]) -> Prior:
     """Prior from the finger's description: one row for each free parameter whose standard deviation it gives."""
     variance = np.diag(cad_covariance(session, parameters))[free]
     rows = np.flatnonzero(variance > 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from jaxfinger.errors import UserError, chosen, counted, require
 from jaxfinger.experiments import SAMPLES, Stack, padded, padded_size, predict_compiled, prepare
 from jaxfinger.identify.fit import Fit
 from jaxfinger.model import Finger, Model, Motion, simulate
+from jaxfinger.progress import Progress
 
 # Longest time step of a forward simulation, in s at the protocol's pace. Steps a quarter as long change angles
 # predicted half a second ahead by less than an encoder's resolution (tests/identify/test_shooting.py).
@@ -29,8 +30,8 @@ def predict_session(
     fit: Fit | Model,
     session: Session,
     names: str | Sequence[str] | None = None,
-    progress: Callable[[str], None] = lambda message: None,
-) -> dict[str, dict[str, np.ndarray]]:
+    progress: Progress = lambda message: None,
+) -> dict[str, dict[str, Float[np.ndarray, "_N _columns"]]]:
     """Predict the channels of the named trials, one or more: `{trial: {channel: (N, columns)}}`, in SI units.
 
     `names`: by default all trials.
@@ -130,7 +131,9 @@ def _only_measurable(channels: dict[str, np.ndarray], trial: Trial, session: Ses
     return channels
 
 
-def simulate_trials(models: Sequence[Model], session: Session, stack: Stack) -> dict[str, dict[str, np.ndarray]]:
+def simulate_trials(
+    models: Sequence[Model], session: Session, stack: Stack
+) -> dict[str, dict[str, Float[np.ndarray, "_N m"]]]:
     """Simulate q, rad, of each VD.3 trial of a full-rate stack from its first sample under the measured tension.
 
     `models`: one for each trial, of one structure.

@@ -36,5 +36,6 @@ def prior_of(
     correlation = covariance[np.ix_(free[known], free[known])] / np.outer(std, std)
     eigenvalues, vectors = np.linalg.eigh(correlation)
     root = np.zeros((known.size, free.size))
+    # Rounding may leave an eigenvalue of zero or less.
     root[:, known] = (vectors / np.sqrt(np.maximum(eigenvalues, 1e-12))).T / std
     return Prior(values[free], root)

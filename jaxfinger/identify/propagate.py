@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from jaxfinger.identify.intervals import Evidence, evidence, laplace, stretches
 from jaxfinger.identify.linearise import Linearised
 from jaxfinger.identify.prior import Prior
-from jaxfinger.identify.solve import Solution, Source, with_all_slopes
+from jaxfinger.identify.solve import Solution, with_all_slopes
+from jaxfinger.identify.sources import Source
 from jaxfinger.model import Model
 
 # A parameter is undetermined where its entry in an undetermined combination exceeds this. Rounding changes entries by

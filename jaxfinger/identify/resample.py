@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.compilation import quick_jit
 from jaxfinger.data import Session
@@ -30,13 +30,14 @@ from jaxfinger.identify.nominal import cad_covariance, cad_prior
 from jaxfinger.identify.parameters import Free, Parameter, describe, ravel
 from jaxfinger.identify.readings import readings_of
 from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import Source, visible
-from jaxfinger.identify.stages import STAGES, sources_of, stage_free
+from jaxfinger.identify.solve import visible
+from jaxfinger.identify.sources import Source, sources_of
+from jaxfinger.identify.stages import STAGES, stage_free
 from jaxfinger.identify.trial_coverage import coverage_of
 
 Batching = Literal["map", "vmap"]
 # For each stage the channels that it reads, by experiment, and the positions of the parameters that it estimates.
-Plan = list[tuple[dict[str, tuple[str, ...]], np.ndarray]]
+Plan = list[tuple[dict[str, tuple[str, ...]], Int[np.ndarray, " _p"]]]
 # Smallest pivot of a Cholesky factor of H_s[s, s], which is the identity where all weights are 1. A smaller one means
 # that a standard deviation would grow by 10⁴: the weighted trials do not determine the combination.
 MIN_PIVOT = 1e-4
@@ -57,7 +58,7 @@ class Compressed:
     sizes: tuple[int, ...]  # number of coordinates: those given (z_0), then those of each stage
     basis: Float[np.ndarray, "P q"]  # δθ = basis z
     theta: Float[np.ndarray, " P"]  # the fit's flat vector
-    positions: dict[str, np.ndarray]  # in the flat vector, of the parameters that each experiment depends on
+    positions: dict[str, Int[np.ndarray, " _k"]]  # in the flat vector, of what each experiment depends on
     information: Float[np.ndarray, "P P"]  # JᵀJ of all trials, without priors
     trials: tuple[str, ...]
     strata: tuple[tuple, ...]  # experiment, joint and tendon of each trial; trials of one stratum are exchangeable

@@ -18,7 +18,7 @@ from scipy.sparse import block_diag, csr_array
 
 from jaxfinger.experiments import Stack, predict_compiled
 from jaxfinger.identify.noise import whiten
-from jaxfinger.identify.solve import Source
+from jaxfinger.identify.sources import Source
 from jaxfinger.model import Model
 
 TORQUE = "joint_torque"

@@ -37,7 +37,7 @@ from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.resample import read_again
-from jaxfinger.identify.solve import Source
+from jaxfinger.identify.sources import Source
 from jaxfinger.model import Model
 
 TRIALS, SENSORS, CAD = "trials", "sensors", "cad"

@@ -13,16 +13,13 @@ cost bends theirs, the compressed rows of the start hold everywhere, and one cal
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfinger.compilation import quick_jit, side_by_side
 from jaxfinger.errors import UserError
-from jaxfinger.experiments import Batch
 from jaxfinger.identify.gauss_newton import (
     Factor,
     Iterate,
@@ -35,21 +32,16 @@ from jaxfinger.identify.gauss_newton import (
     with_linear_rows,
 )
 from jaxfinger.identify.linearise import (
-    NO_REVERSALS,
-    Filters,
     Linearised,
-    Reversals,
     Tangent,
-    White,
     gram_of_linear_rows,
-    residuals_by_tangent,
     tangent,
     triangular,
-    white_tangent,
     whitened,
 )
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.prior import Prior
+from jaxfinger.identify.sources import Source
 from jaxfinger.model import Model
 
 # Lengths of a step, in standard deviations of the estimate, that end a search.
@@ -66,39 +58,6 @@ RUNNING, CONVERGED, KINK, ROUNDED, UNDEFINED_START = (
     Outcome[o] for o in (Outcome.running, Outcome.converged, Outcome.kink, Outcome.rounded, Outcome.undefined_start)
 )
 PADDING = 48  # problems are padded to a multiple of so many parameters, so that they share compiled programs
-
-
-class Source(NamedTuple):
-    """One experiment as a fit reads it: its data, its whitening filters, and the parameters that it depends on."""
-
-    batch: Batch
-    filters: Filters
-    positions: Int[np.ndarray, " k"]  # of those parameters in the flat vector, ascending
-    effects: bool = True  # whether its channels depend on the model's effects, if there are any
-    affine: Int[np.ndarray, " a"] = np.zeros(0, int)  # positions in which its residuals are jointly affine
-    weights: Float[np.ndarray, " B"] | None = None  # of its trials, 1 by default
-    pace: float = 1.0  # duration of its motions over that of the protocol's
-    reversals: Reversals = NO_REVERSALS
-
-    def relevant_model(self, model: Model) -> Model:
-        """Model without effects that the experiment does not depend on, so that they are not compiled."""
-        return model if self.effects or not model.effects else eqx.tree_at(lambda m: m.effects, model, ())
-
-    def seen(self, model: Model) -> tuple[Model, Free]:
-        """`relevant_model`, and the parameters on which the residuals depend, as free ones."""
-        relevant = self.relevant_model(model)
-        return relevant, Free.at(relevant, self.positions)
-
-    def parts(self, model: Model) -> set[str]:
-        """Fields of the model on whose parameters the residuals depend."""
-        return set(self.seen(model)[1].parts)
-
-    def is_affine(self, model: Model, free: Int[np.ndarray, " p"]) -> bool:
-        """Whether the residuals are affine in the free parameters, so that one linearisation is exact."""
-        mine = np.intersect1d(self.positions, free)
-        # With friction of its own torque a drive scales the sum of (1), which is then no longer affine.
-        drives = np.any(np.asarray(model.joint_torque.torque_friction))
-        return not self.relevant_model(model).effects and not drives and bool(np.isin(mine, self.affine).all())
 
 
 @dataclass(frozen=True)
@@ -248,6 +207,11 @@ def solve(
     )
 
 
+def total_cost(model: Model, solution: Solution, free: Int[np.ndarray, " p"], prior: Prior | None) -> float:
+    """Cost that a fit minimises, the prior included."""
+    return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
+
+
 def parameter_bounds(
     model: Model,
     free: Int[np.ndarray, " p"],
@@ -370,15 +334,6 @@ def linearise_each(
     return dict(zip(sources, side_by_side(one, sources), strict=True))
 
 
-def white_tangents(model: Model, sources: dict[str, Source]) -> dict[str, White]:
-    """White residuals and Jacobian of every experiment at the model, not compressed."""
-
-    def one(s: Source) -> White:
-        return white_tangent(tangent(*s.seen(model), s.batch, tuple(s.filters)), s.batch, s.filters, s.reversals)
-
-    return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
-
-
 def with_all_slopes(
     linearised: dict[str, Linearised],
     model: Model,
@@ -390,17 +345,6 @@ def with_all_slopes(
     moved = set(Free.at(model, free).parts)
     lacking = {e: s for e, s in sources.items() if not (s.is_affine(model, free) or s.parts(model) <= moved)}
     return linearised | linearise_each(model, lacking, huber)
-
-
-def residuals_each(
-    model: Model, sources: dict[str, Source]
-) -> dict[str, dict[str, Float[np.ndarray, "_columns _B _T"]]]:
-    """Measured − predicted of every experiment by channel, in the channel's unit, also at samples whose mask is 0."""
-
-    def one(s: Source):
-        return residuals_by_tangent(*s.seen(model), s.batch, tuple(s.filters))
-
-    return dict(zip(sources, side_by_side(one, sources.values()), strict=True))
 
 
 def stacked(
@@ -428,8 +372,11 @@ def visible(A: Float[np.ndarray, "k p"]) -> tuple[Float[np.ndarray, "p v"], Floa
 
 
 def bounded_least_squares(
-    A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray | float = np.inf
-) -> np.ndarray:
+    A: Float[np.ndarray, "N p"],
+    b: Float[np.ndarray, " N"],
+    low: Float[np.ndarray, " p"],
+    high: Float[np.ndarray, " p"] | float = np.inf,
+) -> Float[np.ndarray, " p"]:
     """Minimum δ of ‖A δ + b‖ over low ≤ δ ≤ high, by `gauss_newton.bounded_step`; bounds that exclude 0 move to 0."""
     p = A.shape[1]
     room = _room(p)

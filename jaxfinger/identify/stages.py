@@ -4,46 +4,34 @@ Each stage fits equation (1) to experiments in which some of its terms vanish, a
 others. The parameters of earlier stages stay fixed, and their errors are propagated (`propagate`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.errors import UserError, chosen, require
-from jaxfinger.experiments import Experiment, Stack, not_judged
+from jaxfinger.experiments import Stack, not_judged
 from jaxfinger.identify.fit import Fit, StageReport
+from jaxfinger.identify.fit_with_noise import estimate_with_noise
 from jaxfinger.identify.identifiability import name_invisible, name_traded
-from jaxfinger.identify.noise import LONG_SIGNAL_WINDOW, MIN_STD, SIGNAL_WINDOW, Noise, estimate
+from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.nominal import cad_prior, covariance_before, free_groups, nominal_model
 from jaxfinger.identify.parameters import Parameter, describe, ravel
 from jaxfinger.identify.plausible import implausible
 from jaxfinger.identify.predictions import model_for
-from jaxfinger.identify.prior import Prior
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.recipe import Recipe, checked
-from jaxfinger.identify.shooting import AHEAD
-from jaxfinger.identify.solve import (
-    ROUGH_TOLERANCE,
-    Solution,
-    Source,
-    Tangents,
-    parameter_bounds,
-    residuals_each,
-    solve,
-)
-from jaxfinger.identify.start import start_values
+from jaxfinger.identify.solve import Solution, Tangents, parameter_bounds
+from jaxfinger.identify.sources import DRIVEN
 from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, name_missing, name_unseen
 from jaxfinger.model import Model
-
-Progress = Callable[[str], None]
+from jaxfinger.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -55,40 +43,20 @@ class Stage:
     frees: tuple[str, ...]
 
 
-# Groups on which the torque of a motor that moves a joint depends.
-_DRIVEN = ("elastic", "friction", "damping", "friction_by_direction", "torque_friction", "rotor_inertia")
-
 STAGES = {
     s.name: s
     for s in (
         Stage("ID.2", {"ID.2": ("tendon_excursion",)}, ("moment_arm",)),
         # Between holds the joint moves slowly, so that the stage determines damping, too, though less well.
-        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, _DRIVEN),
+        Stage("ID.3-static", {"ID.3-static": ("joint_torque",)}, DRIVEN),
         # Both phases are read, so that the sweeps refine the estimates from the holds.
         Stage(
             "ID.3-dynamic",
             {"ID.3-static": ("joint_torque",), "ID.3-dynamic": ("joint_torque",)},
-            _DRIVEN,
+            DRIVEN,
         ),
         Stage("ID.4", {"ID.4": ("joint_torque",)}, ("tendon_friction",)),
     )
-}
-
-# Groups of parameters on which each channel of each experiment depends.
-_TORQUE = {*_DRIVEN, "mass", "com"}
-_HELD_TORQUE = {"elastic", "mass", "com", "moment_arm", "tendon_friction"}
-DEPENDS = {
-    ("ID.2", "tendon_excursion"): {"moment_arm"},
-    ("ID.3-static", "joint_torque"): _TORQUE,
-    ("ID.3-dynamic", "joint_torque"): _TORQUE,
-    ("ID.4", "joint_torque"): _HELD_TORQUE,
-    ("ID.4", "tendon_excursion"): {"moment_arm"},
-    ("VD.1", "tendon_excursion"): {"moment_arm"},
-    ("VD.2", "fingertip_force"): _HELD_TORQUE,
-    ("VD.2", "tendon_excursion"): {"moment_arm"},
-    ("VD.3", "joint_torque"): _TORQUE | _HELD_TORQUE,
-    ("VD.3", "tendon_excursion"): {"moment_arm"},
-    (AHEAD, "q"): _TORQUE | _HELD_TORQUE,
 }
 
 
@@ -217,7 +185,12 @@ def name_doubtful(
 
 
 def report_of(
-    name: str, solution: Solution, free: np.ndarray, trials: tuple[str, ...], warnings: list[str], message: str = ""
+    name: str,
+    solution: Solution,
+    free: Int[np.ndarray, " p"],
+    trials: tuple[str, ...],
+    warnings: list[str],
+    message: str = "",
 ) -> StageReport:
     """Report of a stage from its solution; `message` is used where the search converged."""
     return StageReport(
@@ -232,7 +205,7 @@ def report_of(
     )
 
 
-def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Coverage) -> np.ndarray:
+def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Coverage) -> Int[np.ndarray, " p"]:
     """Positions of the parameters that a stage estimates: those of its groups that its trials can determine."""
     groups = set(stage.frees) & free_groups(fit.recipe)
     prior_groups = {"mass", "com"} if fit.recipe.fit.free_inertia and stage.name.startswith("ID.3") else set()
@@ -243,109 +216,3 @@ def stage_free(fit: Fit, stage: Stage, parameters: list[Parameter], coverage: Co
         or (p.group in prior_groups and fit.covariance[i, i] > 0)
     ]
     return np.array(free, dtype=int)
-
-
-def estimate_with_noise(
-    model: Model,
-    free: np.ndarray,
-    stacks: dict[str, Stack],
-    reads: dict[str, tuple[str, ...]],
-    known: dict[tuple[str, str], Noise],
-    prior: Prior | None,
-    huber: float,
-    tangents: Tangents | None = None,
-    fitted: bool = False,
-) -> tuple[Model, Solution, dict[str, Source], dict[tuple[str, str], Noise]]:
-    """Fit the free parameters, after estimating the noise of the channels read unless all of it is `known`.
-
-    Unknown noise is guessed first, or, where the model is `fitted` and taken to be right, estimated from its residuals:
-    the guess is white, with which a fit would follow coloured noise. Then the noise of all channels is estimated twice,
-    each time from the residuals of a fit. The last fit uses Huber's cost.
-
-    Returns:
-        The model, the solution, the sources and the noise.
-    """
-    tangents, parameters, noise = tangents or Tangents(), describe(model), dict(known)
-    window = LONG_SIGNAL_WINDOW if fitted else SIGNAL_WINDOW
-    first = partial(estimate, window=window) if fitted else first_noise
-    unknown = {(e, c): first(stacks[e], c, x) for (e, c), x in residuals_for_noise(model, stacks, reads, noise).items()}
-    model = start_values(model, free, parameters, sources_of(stacks, reads, noise | unknown, parameters))
-    for _ in range(2 if unknown else 0):
-        sources = sources_of(stacks, reads, noise | unknown, parameters)
-        model, solution = solve(model, free, sources, prior, tangents=tangents, tolerance=ROUGH_TOLERANCE)
-        noise |= _noise(solution, stacks, reads, window)
-        unknown = {}
-    sources = sources_of(stacks, reads, noise, parameters)
-    model, solution = solve(model, free, sources, prior, huber, tangents=tangents)
-    again = start_values(model, free, parameters, sources)
-    if again is not model:  # a tendon's friction has slid into a dead zone
-        other, second = solve(again, free, sources, prior, huber, tangents=tangents)
-        if total_cost(other, second, free, prior) < total_cost(model, solution, free, prior):
-            model, solution = other, second
-    return model, solution, sources, noise
-
-
-def total_cost(model: Model, solution: Solution, free: np.ndarray, prior: Prior | None) -> float:
-    """Cost that a fit minimises, the prior included."""
-    return solution.cost + (prior.cost(np.asarray(ravel(model))[free]) if prior else 0.0)
-
-
-def residuals_for_noise(
-    model: Model,
-    stacks: dict[str, Stack],
-    reads: dict[str, tuple[str, ...]],
-    known: dict[tuple[str, str], Noise],
-) -> dict[tuple[str, str], Float[np.ndarray, "_columns _B _T"]]:
-    """Residuals of a model, in the channels' units, by experiment and channel, where the noise is not known."""
-    reads = {e: channels for e, channels in reads.items() if any((e, c) not in known for c in channels)}
-    white = {(e, c): Noise.white(np.ones(len(stacks[e].batch.y[c])), "none") for e in reads for c in reads[e]}
-    residuals = residuals_each(model, sources_of(stacks, reads, white, describe(model)))
-    return {(e, c): np.asarray(residuals[e][c]) for e, c in white if (e, c) not in known}
-
-
-def first_noise(stack: Stack, channel: str, residual: Float[Array | np.ndarray, "columns B T"]) -> Noise:
-    """First guess of a channel's noise: white, as large as the median step of its residuals from sample to sample.
-
-    It serves for a first fit, from whose residuals the noise is estimated. Residuals are used since the channel itself
-    may be zero throughout, as the torque on a free finger.
-    """
-    residual, mask = np.asarray(residual), np.asarray(stack.batch.mask[channel]) > 0
-    step = np.diff(residual, axis=-1)[mask[..., 1:] & mask[..., :-1]]
-    size = float(np.median(np.abs(step))) if step.size else 1.0
-    return Noise.white(np.full(len(residual), max(size, MIN_STD)), "first guess")
-
-
-def _noise(solution: Solution, stacks, reads, window: int) -> dict[tuple[str, str], Noise]:
-    return {
-        (e, c): estimate(stacks[e], c, np.asarray(solution.linearised[e].residuals[c]), window)
-        for e, channels in reads.items()
-        for c in channels
-    }
-
-
-def sources_of(
-    stacks: dict[str, Stack],
-    reads: dict[str, tuple[str, ...]],
-    noise: dict[tuple[str, str], Noise],
-    parameters: list[Parameter],
-) -> dict[str, Source]:
-    """Sources of a fit: every experiment read, with its whitening filters and the parameters that it depends on."""
-    out = {}
-    for e, channels in reads.items():
-        groups = set().union(*(DEPENDS[e, c] for c in channels), {"effects"})
-        positions = np.array([i for i, p in enumerate(parameters) if p.group in groups and p.determinable])
-        groups_affine = set.intersection(*(_affine_groups(stacks[e].experiment, c) for c in channels))
-        affine = np.array([i for i in positions if parameters[i].group in groups_affine], dtype=int)
-        filters = {c: jax.device_put(noise[e, c].coefficients) for c in channels}
-        out[e] = Source(stacks[e].batch, filters, positions, affine=affine, pace=stacks[e].experiment.pace)
-    return out
-
-
-def _affine_groups(experiment: Experiment, channel: str) -> set[str]:
-    """Groups of parameters in which a channel is jointly affine, with all others fixed.
-
-    A torque is affine where the tendons are slack, so that the clipped loss of tendon friction does not enter.
-    """
-    if channel == "tendon_excursion":
-        return {"moment_arm"}
-    return {"elastic", "friction", "damping", "friction_by_direction", "rotor_inertia"} if experiment.slack else set()

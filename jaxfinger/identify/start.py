@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfinger.identify.linearise import white_of
 from jaxfinger.identify.parameters import Parameter
-from jaxfinger.identify.solve import Source, residuals_each
+from jaxfinger.identify.sources import Source, residuals_each
 from jaxfinger.model import Model, TendonFriction
 
 # Candidates for (a₀ over the highest tension, a₁). They span losses from 3 % to 80 % of the tension, and the forms of
@@ -25,7 +25,10 @@ LOSS_CANDIDATES = (
 
 
 def start_values(
-    model: Model, free: np.ndarray, parameters: list[Parameter], sources: dict[str, Source] | None = None
+    model: Model,
+    free: Int[np.ndarray, " p"],
+    parameters: list[Parameter],
+    sources: dict[str, Source] | None = None,
 ) -> Model:
     """Set the friction of each tendon that is free and in a dead zone to the candidate that its trials fit best."""
     pulled = {e: s for e, s in (sources or {}).items() if _shows_friction(s, parameters)}

@@ -12,7 +12,7 @@ experiment, joint and tendon.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session
@@ -29,7 +29,7 @@ class Samples:
 
     values: Float[np.ndarray, "R P"]  # NaN where a member failed
     failed: Bool[np.ndarray, " R"]
-    estimated: np.ndarray  # positions of the estimated parameters
+    estimated: Int[np.ndarray, " p"]  # positions of the estimated parameters
 
     @property
     def covariance(self) -> Float[np.ndarray, "P P"]:

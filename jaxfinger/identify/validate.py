@@ -7,35 +7,31 @@ is arbitrary. Their mean error, like the paper's, is relative to the trial's fir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from html import escape
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from jaxfinger.compilation import one_blas_thread
 from jaxfinger.data import Session, Trial, low_pass
 from jaxfinger.data.schema import CHANNELS
 from jaxfinger.errors import UserError, chosen, require
-from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, predict, predict_compiled, prepare
+from jaxfinger.experiments import EXPERIMENTS, Stack, not_judged, prepare
 from jaxfinger.experiments.table import highest_cutoff
 from jaxfinger.identify.ahead import ahead, diverges, noise_of_simulation
+from jaxfinger.identify.excursion_path import excursion_path
 from jaxfinger.identify.fit import Fit
+from jaxfinger.identify.force_slopes import Slope, force_slopes
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
 from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.model import Model
+from jaxfinger.progress import Progress
 from jaxfinger.table import Table
 
-# Cut-off, Hz at the protocol's pace, of the causal filter with which a controller would differentiate angles: that of
-# VD.3, the motion that it controls.
-ONLINE_CUTOFF = EXPERIMENTS["VD.3"].cutoff
 # Cut-off, Hz, of the low-pass about which an angle of VD.3 scatters by the encoder's noise: twice the experiment's.
 ENCODER_CUTOFF = 20.0
 
@@ -55,19 +51,6 @@ class Score:
     samples: int
     trials: int
     method: str = ""  # names the method where an experiment is judged in two ways
-
-
-@dataclass(frozen=True)
-class Slope:
-    """Slope of the fingertip force along one axis against tension in VD.2, through the holds (the paper's Fig. 9)."""
-
-    trial: str
-    tendon: str
-    axis: str
-    measured: float  # N/N
-    measured_std: float  # N/N, from the scatter of the holds about the model's curve; NaN for two holds
-    predicted: float  # N/N
-    predicted_std: float  # N/N, from the fit's covariance
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,7 +85,7 @@ def validate(
     fit: Fit,
     session: Session,
     experiments: str | Sequence[str] | None = None,
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = lambda message: None,
 ) -> Validation:
     """Score a fit on the trials of the recipe's validation experiments, or on those of `experiments`, one or more.
 
@@ -137,7 +120,7 @@ def validate(
         for channel, residual in residuals.items():
             scores += _channel_scores(session, stack, channel, residual, floors[channel])
         if name == "VD.2":
-            slopes += _slopes(fit, model, session, stack)
+            slopes += force_slopes(fit, model, session, stack)
         if name == "VD.3" and not session.finger.n:
             messages.append("VD.3: without tendons nothing drives a simulation; its torques alone are judged")
         elif name == "VD.3":
@@ -265,35 +248,6 @@ def display(session: Session, channel: str, k: int) -> tuple[float, str]:
 # -- VD.1: the paper's integral ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ExcursionPath:
-    """Excursions of one trial of VD.1, m, relative to its first sample."""
-
-    time: Float[np.ndarray, " N"]
-    measured: Float[np.ndarray, "N n"]
-    integral: Float[np.ndarray, "N n"]  # ∫ C(q) q̇ dt, q̇ from a causal filter, as a controller has it
-    direct: Float[np.ndarray, "N n"]  # f(q) − f(q(0))
-
-
-def excursion_path(model: Model, trial: Trial, pace: float = 1.0) -> ExcursionPath:
-    """Predict the excursions of a trial by both forms of VD.1.
-
-    The paper's integral accumulates the errors of q̇; the difference f(q) − f(q(0)) does not. `pace`: duration of the
-    trial's motion over that of the protocol's.
-    """
-    q = trial.q
-    step = float(np.median(np.diff(trial.time)))
-    sos = butter(2, min(0.9, 2.0 * ONLINE_CUTOFF / pace * step), output="sos")
-    filtered = sosfilt(sos, q, axis=0, zi=sosfilt_zi(sos)[:, :, None] * q[0])[0]
-    qd = np.diff(filtered, axis=0, prepend=filtered[:1]) / np.diff(trial.time, prepend=trial.time[0] - step)[:, None]
-    C = np.asarray(model.moment_arm.coupling(jnp.asarray(q.T)))
-    rate = np.einsum("nmt,tm->tn", C, qd)
-    integral = np.cumsum(rate * np.diff(trial.time, prepend=trial.time[0])[:, None], axis=0)
-    direct = np.asarray(model.moment_arm.excursion(jnp.asarray(q.T))).T
-    measured = np.full(direct.shape, np.nan) if trial.tendon_excursion is None else trial.tendon_excursion
-    return ExcursionPath(trial.time, measured - measured[0], integral, direct - direct[0])
-
-
 def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> list[Score]:
     """Scores of the paper's integral form of VD.1; errors are relative to the first sample."""
     paths = [excursion_path(model, session[name], stack.experiment.pace) for name in stack.trials]
@@ -305,61 +259,6 @@ def _integral_scores(model: Model, session: Session, stack: Stack, floor) -> lis
             noise, method = (float(floor[0][k]), floor[1]), "∫ C q̇ dt, the paper's"
             scores.append(_score(session, "VD.1", "tendon_excursion", k, _errors(series, False), noise, method))
     return scores
-
-
-# -- VD.2: slope of the force against tension -------------------------------------------------------------------------
-
-
-def _slopes(fit: Fit, model: Model, session: Session, stack: Stack) -> list[Slope]:
-    """Slopes of the force along each axis against the tension of the pulled tendon, by regression over the holds."""
-    x, measured = stack.batch.x, np.asarray(stack.batch.y["fingertip_force"])
-    mask, tension = np.asarray(stack.batch.mask["fingertip_force"]), np.asarray(x.tension)
-    lines = []
-    for b, name in enumerate(stack.trials):
-        if (tendon := session[name].tendon) is None:
-            continue
-        f = tension[session.finger.tendon_names.index(tendon), b]  # N
-        for axis in range(3):
-            counts = (mask[axis, b] > 0) & (stack.holds[b] >= 0)
-            if counts.any() and np.ptp(f[counts]) > 0:
-                centred = np.where(counts, f - f[counts].mean(), 0.0)
-                lines.append((name, tendon, axis, b, f, centred / (centred @ f)))  # slope = weights · force
-    if not lines:
-        return []
-
-    def slopes(m: Model):
-        force = predict(m, x, ("fingertip_force",))["fingertip_force"]
-        return jnp.stack([jnp.asarray(w) @ force[axis, b] for _, _, axis, b, _, w in lines])
-
-    values, std = replace(fit, model=model).function(eqx.filter_jit(slopes))
-    predicted = np.asarray(predict_compiled(model, x, ("fingertip_force",))["fingertip_force"])
-    return [
-        Slope(
-            name,
-            tendon,
-            "xyz"[axis],
-            float(w @ measured[axis, b]),
-            _slope_std(f, measured[axis, b] - predicted[axis, b], w),
-            float(values[k]),
-            float(std[k]),
-        )
-        for k, (name, tendon, axis, b, f, w) in enumerate(lines)
-    ]
-
-
-def _slope_std(f: np.ndarray, errors: np.ndarray, weights: np.ndarray) -> float:
-    """Standard deviation of a slope, from the scatter of the means of holds about the model's curve.
-
-    NaN for two holds, through which a line goes without scatter.
-    """
-    counts = weights != 0
-    levels, hold = np.unique(f[counts], return_inverse=True)  # within a hold the tension is constant, its mean
-    if levels.size < 3:
-        return float("nan")
-    mean = np.bincount(hold, errors[counts]) / np.bincount(hold)
-    centred = levels - levels.mean()
-    rest = mean - mean.mean() - (centred @ mean) / (centred @ centred) * centred
-    return float(np.sqrt(rest @ rest / (levels.size - 2) / (centred @ centred)))
 
 
 # -- VD.3: forward simulation -----------------------------------------------------------------------------------------

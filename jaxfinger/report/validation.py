@@ -12,8 +12,9 @@ from jaxfinger.data.atomic import folder_to_fill
 from jaxfinger.data.signals.sizes import sizes_of
 from jaxfinger.experiments import Stack, predict_compiled, prepare
 from jaxfinger.identify import Fit
+from jaxfinger.identify.excursion_path import excursion_path
 from jaxfinger.identify.predictions import model_for, predict_session
-from jaxfinger.identify.validate import display, excursion_path
+from jaxfinger.identify.validate import display
 from jaxfinger.model import Model
 from jaxfinger.report import plots
 from jaxfinger.report.theme import grid, legend_beside, look, save

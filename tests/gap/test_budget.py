@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxfinger.gap.budget import Budget, Cell, held_out_gains
+from jaxfinger.gap.budget import Budget, Cell, _solved, held_out_gains
 from jaxfinger.gap.folds import FOLDS, fold_of_row
 
 
@@ -23,6 +23,19 @@ def test_a_cause_explains_trials_that_it_has_not_seen_and_luck_does_not(planted)
     assert luck == pytest.approx(0.0, abs=0.02)
     assert imitator == pytest.approx(0.5, abs=0.03)  # cos² of the angle to the cause
     assert together < cause
+
+
+def test_a_refit_is_sound_where_trials_do_not_show_a_column_or_tell_it_from_others():
+    rng = np.random.default_rng(0)
+    J = 1e7 * rng.standard_normal((2000, 4))  # so sensitive that the prior of the folds is less than rounding
+    J[:, 2], J[:, 3] = J[:, 0], 0.0
+    r = J[:, 0] - J[:, 1] + rng.standard_normal(2000)
+    X = np.column_stack([r, J])
+    x = _solved(X.T @ X, np.zeros((5, 5)), np.eye(5)[0], [1, 2, 3, 4])
+    assert x[4] == 0.0
+    assert np.abs(x[1:4]).max() < 2.0
+    _, (left,), *_ = np.linalg.lstsq(J[:, :2], r)
+    assert np.sum((X @ x) ** 2) == pytest.approx(left, rel=1e-3)
 
 
 CHANNELS = (("ID.4", "joint_torque"), ("ID.4", "tendon_excursion"))

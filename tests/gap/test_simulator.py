@@ -18,9 +18,9 @@ from jaxfinger.gap.problem import build
 from jaxfinger.gap.result import Key
 from jaxfinger.gap.simulator import emulate
 from jaxfinger.identify import Recipe, identify
+from jaxfinger.identify.fit_with_noise import first_noise
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.predictions import predict_session
-from jaxfinger.identify.stages import first_noise
 from jaxfinger.synthetic import (
     SpecimenPlant,
     paper_finger,

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from jaxfinger.effects import CATALOGUE
 from jaxfinger.experiments import SAMPLES, TRIALS, blocks, in_rows, padded_size, predict, prepare, shapes
+from jaxfinger.identify.fit_with_noise import first_noise
 from jaxfinger.identify.linearise import (
     _tangent,
     linearise,
@@ -20,8 +21,8 @@ from jaxfinger.identify.linearise import (
     white_rows,
 )
 from jaxfinger.identify.parameters import Free, describe
-from jaxfinger.identify.solve import Tangents, residuals_each
-from jaxfinger.identify.stages import first_noise, sources_of
+from jaxfinger.identify.solve import Tangents
+from jaxfinger.identify.sources import residuals_each, sources_of
 
 EXPERIMENT, CHANNELS = "ID.4", ("joint_torque", "tendon_excursion")
 

@@ -7,7 +7,7 @@ import pytest
 from jaxfinger.identify.linearise import Tangent, white_of, white_tangent
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.reversals import with_reversals
-from jaxfinger.identify.solve import Source
+from jaxfinger.identify.sources import Source
 from tests.identify.test_noise import stack_of
 
 T, COLUMNS, TRIALS = 60, 2, 2

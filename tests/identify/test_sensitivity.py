@@ -15,7 +15,7 @@ from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.resample import plan_of
 from jaxfinger.identify.sensitivity import sensitivity
 from jaxfinger.identify.solve import solve
-from jaxfinger.identify.stages import sources_of
+from jaxfinger.identify.sources import sources_of
 
 pytestmark = pytest.mark.long
 

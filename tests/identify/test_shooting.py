@@ -12,11 +12,12 @@ from jaxfinger.errors import UserError
 from jaxfinger.experiments import prepare
 from jaxfinger.identify import identify, refine
 from jaxfinger.identify.ahead import ahead
+from jaxfinger.identify.fit_with_noise import first_noise
 from jaxfinger.identify.linearise import residuals_of, tangent
 from jaxfinger.identify.parameters import Free, describe, ravel
 from jaxfinger.identify.sensitivity import sensitivity
 from jaxfinger.identify.shooting import AHEAD, shooting
-from jaxfinger.identify.stages import first_noise, sources_of
+from jaxfinger.identify.sources import sources_of
 from jaxfinger.identify.starts import starts
 from jaxfinger.model import Motion, external_torque, simulate, simulated_ahead
 from jaxfinger.synthetic import recipe_from, specimen_of, true_model

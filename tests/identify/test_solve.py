@@ -13,9 +13,10 @@ from jaxtyping import Array, Float
 from jaxfinger.effects import CatalogueEffect, amplitude
 from jaxfinger.errors import UserError
 from jaxfinger.experiments import predict, prepare
+from jaxfinger.identify.fit_with_noise import first_noise
 from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.solve import KINK_TOLERANCE, ROUGH_TOLERANCE, bounded_least_squares, solve
-from jaxfinger.identify.stages import first_noise, sources_of
+from jaxfinger.identify.sources import sources_of
 
 EXPERIMENT, CHANNEL = "ID.3-static", "joint_torque"
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfinger.errors import UserError
-from jaxfinger.identify.validate import excursion_path, validate
+from jaxfinger.identify.excursion_path import excursion_path
+from jaxfinger.identify.validate import validate
 from jaxfinger.model import Model
 
 
