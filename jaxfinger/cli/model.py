@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from jaxfinger.cli.output import Output, print_json, progress, read, refuse_effects, refuse_output
 from jaxfinger.errors import UserError, counted
 from jaxfinger.fit_content import read_content
+
+if TYPE_CHECKING:
+    from jaxfinger.identify import Fit
 
 Experiments = Annotated[list[str] | None, Parameter(name=["--experiments", "-e"], consume_multiple=True)]
 
@@ -59,6 +62,7 @@ def identify(
         say("reading the file")
         session = read(file)
         fit = run(session, wanted, progress=say)
+        _refuse_empty(fit, file)
         if joint or ahead:
             fit = _refine(fit, session, say, ahead)
         content = _write(fit, session, output, overwrite)
@@ -89,12 +93,15 @@ def _fit(
         session = read(file)
         first = load_fit(start, effects) if start else None
         fit = run(session, None if first else read_recipe(recipe), stages, first, say)
-        if all(s.status == "skipped" for s in fit.stages):
-            raise UserError(
-                f"{file}: {'; '.join(s.message for s in fit.stages)}; nothing is fitted, so nothing written"
-            )
+        _refuse_empty(fit, file)
         content = _write(fit, session, output, overwrite)
     _report(content, json)
+
+
+def _refuse_empty(fit: Fit, file: Path) -> None:
+    """Refuse a fit of which no stage had trials to read: its numbers would be the finger's description and zeros."""
+    if all(s.status == "skipped" for s in fit.stages):
+        raise UserError(f"{file}: {'; '.join(s.message for s in fit.stages)}; nothing is fitted, so nothing written")
 
 
 def _stage_command(name: str, stages: tuple[str, ...], summary: str):

@@ -1,5 +1,6 @@
 """Identifiability: combinations of parameters that the trials do not determine, remedies, and base parameters."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -84,9 +85,14 @@ def directions(
 
 
 def name_invisible(
-    parameters: list[Parameter], free: Int[np.ndarray, " p"], invisible: Float[np.ndarray, "k p"]
+    parameters: list[Parameter],
+    free: Int[np.ndarray, " p"],
+    invisible: Float[np.ndarray, "k p"],
+    told: Collection[int] = (),
 ) -> list[str]:
     """Sentences on what is undetermined, each with a remedy; the rows of `invisible` are orthonormal.
+
+    `told`: positions of parameters of which another sentence says why the trials do not show them by themselves.
 
     Of the space that these rows span any other basis is as good. So parameters that lie in it by themselves are named
     together. Others are named by combinations of those that trade off, in one sentence for each remedy; parameters that
@@ -94,9 +100,10 @@ def name_invisible(
     """
     alone = np.sum(invisible**2, axis=0) > 1.0 - MIN_SHOWN_ENTRY**2
     sentences, combinations = [], {}
-    if alone.any():
-        names = ", ".join(parameters[i].name for i in free[alone])
-        sentences.append(f"the trials do not show {names}; record {_remedy(parameters, free[alone])}")
+    untold = free[alone & ~np.isin(free, list(told))]
+    if untold.size:
+        names = ", ".join(parameters[i].name for i in untold)
+        sentences.append(f"the trials do not show {names}; record {_remedy(parameters, untold)}")
     for v in _apart(np.where(alone, 0.0, invisible)):
         names = " ".join(f"{c:+.2f}·[{name}]" for name, c in _shares(parameters, free, v).items())
         combinations.setdefault(_mend(parameters, _involved(free, v)), []).append(names)

@@ -96,7 +96,7 @@ def refine(session: Session, fit: Fit, progress: Progress = lambda message: None
     if better:
         warnings.append("the earlier fit led to a poorer optimum")
     covariance = propagate(fit.covariance, model, solution, sources, free, prior, huber)
-    warnings += name_doubtful(model, start, solution, covariance, free)
+    warnings += name_doubtful(model, start, solution, sources, covariance, free)
     refined = replace(
         fit.made_from(session, alone=same),
         model=model,
@@ -150,7 +150,7 @@ def _on_motion(fit: Fit, starts: Shooting, sources: dict[str, Source], prior: Pr
     covariance = propagate(before, model, solution, sources, free, prior, huber)
     moved, corrected = (np.asarray(ravel(model)) - np.asarray(ravel(m)) for m in (fit.model, first))
     covariance += _contradiction(moved, fit.std**2, np.diag(covariance)) + np.outer(corrected, corrected)
-    warnings = name_doubtful(model, fit.model, solution, covariance, free)
+    warnings = name_doubtful(model, fit.model, solution, sources, covariance, free)
     refined = replace(fit, model=model, covariance=covariance)
     report = report_of(
         AHEAD, solution, free, starts.stack.trials, warnings, _gain(fit, refined, "those of the joint refinement")

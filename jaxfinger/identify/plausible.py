@@ -1,5 +1,7 @@
 """Warnings of implausible estimates: negative damping, inertia or friction, mass on its bound, loss above 100 %."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -37,6 +39,22 @@ def implausible(
             )
     out += _negative_friction(model, covariance, free, parameters)
     return out + _excess_losses(values, std, free, parameters)
+
+
+def name_bounded(ends: Mapping[str, str]) -> list[str]:
+    """One sentence for all tendons that lose `none` of their tension in a fit, and one for those that lose `all`."""
+    meanings = {
+        "none": "there may be no friction, or the torques are larger than tension and moment arms make them",
+        "all": "the torques do not follow the tension as the moment arms have it",
+    }
+    sentences = []
+    for end, meaning in meanings.items():
+        if names := [tendon for tendon, found in ends.items() if found == end]:
+            sentences.append(
+                f"the fit loses {end} of the tension of {', '.join(names)}, so friction there has no interval (± ?): "
+                f"{meaning}; check sign, units and columns of tendon_force, tendon_excursion and joint_torque"
+            )
+    return sentences
 
 
 def _with_interval(p: Parameter, value: float, std: float) -> str:

@@ -22,13 +22,14 @@ from jaxfinger.identify.identifiability import name_invisible, name_traded
 from jaxfinger.identify.noise import Noise
 from jaxfinger.identify.nominal import cad_prior, covariance_before, free_groups, nominal_model
 from jaxfinger.identify.parameters import Parameter, describe, ravel
-from jaxfinger.identify.plausible import implausible
+from jaxfinger.identify.plausible import implausible, name_bounded
 from jaxfinger.identify.predictions import model_for
 from jaxfinger.identify.propagate import propagate
 from jaxfinger.identify.readings import name_constant, readings_of
 from jaxfinger.identify.recipe import Recipe, checked
 from jaxfinger.identify.solve import Solution, Tangents, parameter_bounds
-from jaxfinger.identify.sources import DRIVEN
+from jaxfinger.identify.sources import DRIVEN, Source
+from jaxfinger.identify.start import bounded_losses, highest_tensions
 from jaxfinger.identify.trial_coverage import Coverage, can_determine, coverage_of, name_missing, name_unseen
 from jaxfinger.model import Model
 from jaxfinger.progress import Progress
@@ -158,7 +159,7 @@ def run_stage(
     needed = read[[parameters[i].group in free_groups(recipe) for i in read]]
     warnings = constant + name_missing(parameters, np.asarray(ravel(model)), determined, needed, coverage)
     warnings += name_unseen(parameters, groups, free)
-    warnings += name_doubtful(model, fit.model, solution, covariance, free)
+    warnings += name_doubtful(model, fit.model, solution, sources, covariance, free)
     trials = tuple(t for e in reads for t in stacks[e].trials)
     report = report_of(stage.name, solution, free, trials, warnings)
     return replace(fit, model=model, covariance=covariance, estimated=fitted, noise=noise, stages=(*fit.stages, report))
@@ -168,18 +169,25 @@ def name_doubtful(
     model: Model,
     start: Model,
     solution: Solution,
+    sources: dict[str, Source],
     covariance: Float[np.ndarray, "P P"],
     free: Int[np.ndarray, " p"],
 ) -> list[str]:
     """Warnings of estimates that the trials do not show, or only together, and of those that no machine can have.
 
-    `start`: the model from which the fit went, whose masses bound those of `model`.
+    `start`: the model from which the fit went, whose masses bound those of `model`. `sources`: what was fitted.
     """
-    parameters = describe(model)
+    parameters, values = describe(model), np.asarray(ravel(model))
     lightest, _ = parameter_bounds(start, free)
+    ends = bounded_losses(model, free, parameters, highest_tensions(model, sources, parameters))
+    armed = {p.tendon for p, value in zip(parameters, values, strict=True) if p.group == "moment_arm" and value != 0.0}
+    # `name_missing` speaks of tendons without a moment arm, and `name_bounded` of those at an end of their friction.
+    unlike = {p.tendon for p in parameters if p.tendon in ends or p.tendon not in armed}
+    told = [i for i in free.tolist() if parameters[i].group == "tendon_friction" and parameters[i].tendon in unlike]
     return [
-        *name_invisible(parameters, free, solution.invisible),
-        *name_traded(parameters, np.asarray(ravel(model)), covariance, free),
+        *name_invisible(parameters, free, solution.invisible, told),
+        *name_bounded({tendon: end for tendon, end in ends.items() if tendon in armed}),
+        *name_traded(parameters, values, covariance, free),
         *implausible(model, covariance, free, lightest),
     ]
 

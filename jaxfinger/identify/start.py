@@ -46,6 +46,30 @@ def start_values(
     return model
 
 
+def bounded_losses(
+    model: Model, free: np.ndarray, parameters: list[Parameter], highest: Float[np.ndarray, " n"]
+) -> dict[str, str]:
+    """Tendons whose friction is free and at a bound: `none` or `all` of the tension is lost, by name.
+
+    That is so where it holds from half of the `highest` tension on (N; 0 where a tendon is not pulled): below, little
+    torque comes that could tell.
+    """
+    friction = model.tendon_friction
+    constant, proportional = np.asarray(friction.constant), np.asarray(friction.proportional)
+    ends = {}
+    for k in (k for k in _free_tendons(model, free, parameters) if highest[k] > 0.0):
+        tension = highest[k] * np.array([0.5, 1.0])  # The loss is affine, so its ends tell.
+        loss = constant[k] + proportional[k] * tension
+        if np.all(loss <= 0.0) or np.all(loss >= tension):
+            ends[model.finger.tendon_names[k]] = "none" if loss[-1] <= 0.0 else "all"
+    return ends
+
+
+def highest_tensions(model: Model, sources: dict[str, Source], parameters: list[Parameter]) -> Float[np.ndarray, " n"]:
+    """Highest tension of each tendon, N, in the trials that show friction; 0 where none pulls it."""
+    return _highest(model, {e: s for e, s in sources.items() if _shows_friction(s, parameters)})
+
+
 def _shows_friction(source: Source, parameters: list[Parameter]) -> bool:
     return any(parameters[i].group == "tendon_friction" for i in source.positions)
 

@@ -9,9 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfinger.data import Session, joints_of, moving_joints
+from jaxfinger.errors import listed
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.identify.identifiability import REMEDIES
 from jaxfinger.identify.parameters import Parameter
+
+_WORDS = {"moment_arm": "moment arms", "elastic": "elastic torque", "tendon_friction": "tendon friction"}  # of groups
 
 
 class Coverage(NamedTuple):
@@ -78,6 +81,30 @@ def name_missing(
         for law, has in missing.items()
         if not any(has)
     ]
+
+
+def name_unfitted(
+    parameters: list[Parameter],
+    values: Float[np.ndarray, " P"],
+    estimated: Int[np.ndarray, " k"],
+    groups: Collection[str],
+) -> list[str]:
+    """One sentence on the laws of `groups` that predictions take as zero, since no trial of the fit showed them.
+
+    `estimated`: positions of the fit's estimates. A law with a value that is not zero is given by the description.
+    """
+    known = {*estimated.tolist(), *np.flatnonzero(values).tolist()}
+    laws: dict[tuple[str, str], list[bool]] = {}
+    for i, p in enumerate(parameters):
+        name = p.tendon or p.joint
+        if p.group in groups and p.determinable and name is not None:
+            laws.setdefault((p.group, name), []).append(i in known)
+    missing: dict[str, list[str]] = {}
+    for (group, name), has in laws.items():
+        if not any(has):
+            missing.setdefault(_WORDS.get(group, group), []).append(name)
+    said = ", and the ".join(f"{words} of {listed(names)}" for words, names in missing.items())
+    return [f"no trial of the fit showed the {said}, and predictions take them as zero"] if said else []
 
 
 def _law(group: str, tendon: str | None, joint: str) -> str:

@@ -26,8 +26,12 @@ from jaxfinger.identify.fit import Fit
 from jaxfinger.identify.force_slopes import Slope, force_slopes
 from jaxfinger.identify.linearise import residuals_of
 from jaxfinger.identify.noise import estimate
+from jaxfinger.identify.nominal import free_groups
+from jaxfinger.identify.parameters import describe, ravel
 from jaxfinger.identify.predictions import model_for, simulate_trials
 from jaxfinger.identify.readings import name_constant, readings_of
+from jaxfinger.identify.sources import DEPENDS
+from jaxfinger.identify.trial_coverage import name_unfitted
 from jaxfinger.model import Model
 from jaxfinger.progress import Progress
 from jaxfinger.table import Table
@@ -127,6 +131,9 @@ def validate(
             progress("simulating VD.3 forward in time")
             simulated, diverging = _simulation_scores(model, session, list(stack.trials))
             scores, messages = scores + simulated, messages + diverging
+    depends = {g for e, stack in stacks.items() for c in stack.experiment.channels for g in DEPENDS.get((e, c), ())}
+    groups = depends & free_groups(fit.recipe)
+    messages += name_unfitted(describe(model), np.asarray(ravel(model)), fit.estimated, groups)
     messages += [f"the session has no {e} trial" for e in wanted if e not in stacks]
     messages += name_constant({e: stack.experiment.channels for e, stack in stacks.items()}, session)
     messages += [f"{experiment}: no {c} sample is judged: {why}" for experiment, c, why in not_judged(stacks)]

@@ -330,6 +330,15 @@ def test_a_mistake_is_one_sentence_and_exit_code_2(folder, tmp_path, capsys, tok
     assert not list(tmp_path.iterdir())
 
 
+def test_a_fit_without_a_single_stage_is_refused(folder, tmp_path, capsys):
+    """Its numbers would be those of the finger's description, and zeros."""
+    recipe = tmp_path / "arms.toml"
+    recipe.write_text('name = "arms"\n[fit]\nstages = ["ID.2"]\n')
+    assert run("identify", folder / "emps.h5", "-o", tmp_path / "x.json", "--recipe", recipe) == 2
+    assert "no ID.2 trial; nothing is fitted, so nothing written" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "x.json").exists()
+
+
 def test_overwriting_when_asked(folder, tmp_path):
     out = tmp_path / "p.h5"
     out.write_text("old")

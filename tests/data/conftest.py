@@ -89,7 +89,7 @@ def make_session() -> Session:
     trials.append(Trial("06-VD.2-T1", "VD.2", time, q, force, None, None, tip, hold=hold, tendon="T1", complete=False))
     q = np.column_stack([sweep, 0.5 * sweep])
     warm = {"temperature": 300.0 + np.outer(time, [0.1, 0.2]), "temperature_names": ("motor T1", "motor T2")}
-    trials.append(Trial("07-VD.3", "VD.3", time, q, tension(), excursion, **warm))
+    trials.append(Trial("07-VD.3", "VD.3", time, q, tension(2.0 + 0.5 * sweep), excursion, **warm))
     q = np.column_stack([sweep, 0.5 * sweep])  # Both joints move at once, so the trial has no attribute `joint`.
     trials.append(Trial("08-ID.3-dynamic", "ID.3-dynamic", time, q, joint_torque=0.01 * q))
     return Session("test finger", make_finger(), {t.name: t for t in trials}, "tests", "2026-01-01T00:00:00+00:00")

@@ -35,6 +35,9 @@ def test_parameters_that_no_trial_touches_are_named_together_and_not_as_combinat
     turned = np.array([[0.6, 0.8, 0.0], [0.8, -0.6, 0.0]])
     (sentence,) = name_invisible(PARAMETERS, np.arange(3), turned)
     assert sentence.startswith("the trials do not show elastic torque MCP^0, elastic torque MCP^1; record ID.3-static")
+    (sentence,) = name_invisible(PARAMETERS, np.arange(3), turned, told=[1])
+    assert sentence.startswith("the trials do not show elastic torque MCP^0; record ID.3-static")
+    assert not name_invisible(PARAMETERS, np.arange(3), turned, told=[0, 1])
     mixed = np.array([[0.0, 1.0, 0.0], [np.sqrt(0.5), 0.0, -np.sqrt(0.5)]])
     mixed = np.array([[0.6, 0.8], [0.8, -0.6]]) @ mixed
     alone, traded = name_invisible(PARAMETERS, np.arange(3), mixed)

@@ -7,7 +7,10 @@ import pytest
 
 from jaxfinger.errors import UserError
 from jaxfinger.identify import Fit, Recipe, identify
+from jaxfinger.identify.parameters import describe
+from jaxfinger.identify.plausible import name_bounded
 from jaxfinger.identify.recipe import ModelRecipe
+from jaxfinger.identify.start import bounded_losses
 from jaxfinger.model import TendonFriction
 from jaxfinger.synthetic import ModelPlant, paper_finger, polynomial_finger, recipe_from, simulate, true_model
 
@@ -66,3 +69,23 @@ def test_a_start_and_another_recipe_are_refused():
     start = Fit.before(session, Recipe(), true_model(polynomial_finger(paper_finger())))
     with pytest.raises(UserError, match="a fit to start from brings its own recipe; leave out `recipe` or `start`"):
         identify(session, Recipe(model=ModelRecipe(elastic_degree=3)), start=start)
+
+
+def test_friction_that_ends_at_a_bound_is_a_contradiction_or_none_and_no_lack_of_tensions():
+    """Nothing depends on it there. Torques that are too large for the tensions, or go against them, lead there."""
+    model = true_model(polynomial_finger(paper_finger()))
+    n, parameters = model.finger.n, describe(model)
+    constant, proportional = np.full(n, 0.2), np.full(n, 0.1)
+    constant[:3], proportional[:3] = (12.0, -12.0, 0.0), (-5.0, 3.0, 0.0)  # from 8 N on: nothing, all, nothing
+    friction = TendonFriction(jnp.asarray(constant), jnp.asarray(proportional))
+    model = eqx.tree_at(lambda m: m.tendon_friction, model, friction)
+    free = np.flatnonzero([p.group == "tendon_friction" for p in parameters])
+    highest = np.where(np.arange(n) == 2, 0.0, max(TENSIONS))  # the third is never pulled
+    ends = bounded_losses(model, free, parameters, highest)
+    first, second, *_ = model.finger.tendon_names
+    assert ends == {first: "none", second: "all"}
+    none, everything = name_bounded(ends)
+    assert none.startswith(f"the fit loses none of the tension of {first}, so friction there has no interval (± ?)")
+    assert everything.startswith(f"the fit loses all of the tension of {second}, so")
+    assert all("check sign, units and columns of tendon_force" in text for text in (none, everything))
+    assert not name_bounded({})

@@ -7,7 +7,7 @@ from jaxfinger.data import Session
 from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.identify import identify
 from jaxfinger.identify.parameters import describe, ravel
-from jaxfinger.identify.trial_coverage import Coverage, name_missing
+from jaxfinger.identify.trial_coverage import Coverage, name_missing, name_unfitted
 from jaxfinger.synthetic import study_finger, true_model
 
 MODEL = true_model(study_finger(2))
@@ -40,3 +40,14 @@ def test_tendon_friction_without_the_joints_torque_says_what_it_rests_on(session
     said = identify(without, staged.recipe).stages[-1].warnings
     held = {t.joint for t in session if EXPERIMENTS[t.experiment].held}
     assert {w.split(" is taken as zero")[0] for w in said} >= {f"the elastic torque of joint {j}" for j in held}
+
+
+def test_laws_that_no_trial_showed_are_named_where_predictions_take_them_as_zero():
+    groups = {"moment_arm", "elastic", "tendon_friction"}
+    no_arms = np.where([p.group == "moment_arm" for p in PARAMETERS], 0.0, VALUES)
+    (sentence,) = name_unfitted(PARAMETERS, no_arms, np.zeros(0, int), groups)
+    assert sentence.startswith("no trial of the fit showed the moment arms of T1")
+    assert "elastic" not in sentence
+    fitted = np.flatnonzero([p.group == "moment_arm" for p in PARAMETERS])
+    assert not name_unfitted(PARAMETERS, no_arms, fitted, groups)
+    assert not name_unfitted(PARAMETERS, no_arms, np.zeros(0, int), {"elastic"})

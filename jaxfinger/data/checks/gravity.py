@@ -23,16 +23,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxfinger.data.checks.blocks import MIN_POSTURE, Motion, motion_of
 from jaxfinger.data.findings import Report
 from jaxfinger.data.mounting import gravity_levers
 from jaxfinger.data.session import FingerDescription, Session, Trial, moving_joints
-from jaxfinger.data.signals.motion import STILL_SHARE, directions
 from jaxfinger.errors import listed
 
-_BLOCKS = 300  # of a trial, of which means are taken: the protocol's quickest cycle still has ten of them.
 _ANGLES = 30  # Parts of a joint's range. Departures from the model are alike within one, so it counts as one value.
 _DEGREE = 5  # of the elastic torque over the angle: a spring that stiffens towards both of its ends
-_MIN_POSTURE = 0.2  # rad between two postures: the weight's curve moves by as much.
 _MAX_STD = 0.12  # of gravity: the change that is reported is then six standard deviations.
 # Of gravity, the length of its change: that of a turn by 45°, half of the quarter turn that the smallest mistake makes.
 _MIN_TURN = 0.77
@@ -45,15 +43,6 @@ _MAX_SCALE = 2.0  # of a torque, up or down: masses and their places are known b
 _MIN_REST = 0.1
 # Of a torque's variance, what the weight explains where the torque follows it.
 _MIN_FOLLOWED = 0.9
-
-
-class _Motion(NamedTuple):
-    """Means over the blocks of a trial in which a motor moves one joint, without the blocks where it turns round."""
-
-    q: np.ndarray  # (N, m)
-    torque: np.ndarray  # (N,), of the motor
-    dynamics: np.ndarray  # (N, 1 + k): speed, and accelerations of all joints that move
-    direction: np.ndarray  # (N,): −1 or 1
 
 
 class _Equations(NamedTuple):
@@ -70,11 +59,11 @@ def check_gravity(session: Session, report: Report) -> None:
     if any(finger.prismatic) or size == 0.0:
         return
     coupled = _coupled(finger)
-    motions: dict[int, list[_Motion]] = defaultdict(list)
+    motions: dict[int, list[Motion]] = defaultdict(list)
     for trial in session.select("ID.3-static", "ID.3-dynamic"):
         if (i := finger.joint(trial.joint)) is not None and i not in coupled:
-            motions[i] += _motion(trial, i, [i])
-    told = [i for i, of in motions.items() if _postures(of, i) > _MIN_POSTURE]
+            motions[i] += motion_of(trial, i, [i])
+    told = [i for i, of in motions.items() if _postures(of, i) > MIN_POSTURE]
     parts = [_equations(finger, i, motions[i]) for i in told]
     if not parts:
         return
@@ -110,7 +99,7 @@ def check_torque_scales(session: Session, report: Report) -> None:
         if trial.joint is not None or len(moving) < 2:
             continue
         told = [i for i in moving if i not in coupled and not finger.prismatic[i]]
-        scales = {i: _torque_scale(finger, i, motion) for i in told for motion in _motion(trial, i, moving)}
+        scales = {i: _torque_scale(finger, i, motion) for i in told for motion in motion_of(trial, i, moving)}
         wrong = [
             f"{scale:.2g} of it at {finger.joint_names[i]}"
             for i, scale in scales.items()
@@ -146,7 +135,7 @@ def _following_gravity(
     """Joints whose torque goes as the weight or against it, with its multiple."""
     follows = {}
     for i in joints:
-        for motion in _motion(trial, i, moving):
+        for motion in motion_of(trial, i, moving):
             weight = -gravity_levers(finger, motion.q)[:, i] @ finger.gravity
             own = np.column_stack([np.ones(len(weight)), motion.direction])
             wanted = np.column_stack([weight, motion.torque])
@@ -157,7 +146,7 @@ def _following_gravity(
     return follows
 
 
-def _torque_scale(finger: FingerDescription, i: int, motion: _Motion) -> float | None:
+def _torque_scale(finger: FingerDescription, i: int, motion: Motion) -> float | None:
     """Torque of joint i over the one that gravity takes; None where the motion does not tell."""
     levers, torques, free = _equations(finger, i, [motion])
     weight = levers @ finger.gravity
@@ -176,30 +165,7 @@ def _coupled(finger: FingerDescription) -> set[int]:
     return set(np.flatnonzero(finger.crosses[shared].any(axis=0)).tolist())
 
 
-def _motion(trial: Trial, i: int, moving: Sequence[int]) -> list[_Motion]:
-    """The trial's motion as joint i sees it, where joints `moving` move.
-
-    There is none where values are missing or too few, or the joint stands still.
-    """
-    if trial.joint_torque is None or len(trial.time) < _BLOCKS:
-        return []
-    size = len(trial.time) // _BLOCKS
-    columns = np.column_stack([trial.time, trial.joint_torque[:, i], trial.q])[: _BLOCKS * size]
-    time, torque, *angles = columns.reshape(_BLOCKS, size, -1).mean(axis=1).T
-    q = np.column_stack(angles)
-    rate = np.gradient(q[:, i], time)
-    accelerations = [np.gradient(np.gradient(q[:, k], time), time) for k in moving]
-    dynamics = np.column_stack([rate, *accelerations])
-    if not (np.isfinite(columns).all() and np.isfinite(dynamics).all() and np.ptp(q[:, i]) > _MIN_POSTURE):
-        return []
-    # Slow blocks count where the joint goes on in the direction in which it came.
-    least = STILL_SHARE * np.percentile(np.abs(rate), 99, keepdims=True)
-    before, after = (directions(rate[way, None], least)[way, 0] for way in (slice(None), slice(None, None, -1)))
-    goes_on = (before == after) & (before != 0.0)
-    return [_Motion(q[goes_on], torque[goes_on], dynamics[goes_on], before[goes_on])] if goes_on.any() else []
-
-
-def _postures(motions: list[_Motion], i: int) -> float:
+def _postures(motions: list[Motion], i: int) -> float:
     """Largest change of another joint's angle from trial to trial, rad."""
     if not motions:
         return 0.0
@@ -207,7 +173,7 @@ def _postures(motions: list[_Motion], i: int) -> float:
     return float(np.ptp(means, axis=0).max(initial=0.0))
 
 
-def _equations(finger: FingerDescription, i: int, motions: list[_Motion]) -> _Equations:
+def _equations(finger: FingerDescription, i: int, motions: list[Motion]) -> _Equations:
     """What the trials of joint i say of gravity."""
     q = np.concatenate([motion.q for motion in motions])
     angle = (q[:, i] - q[:, i].min()) / np.ptp(q[:, i])

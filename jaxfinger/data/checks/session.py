@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxfinger.data.checks.columns import check_columns
 from jaxfinger.data.checks.copies import check_copied_columns, check_copied_trials
+from jaxfinger.data.checks.curves import check_curves
 from jaxfinger.data.checks.delay import check_delay
 from jaxfinger.data.checks.finger import check_finger
 from jaxfinger.data.checks.gravity import check_gravity, check_torque_scales
@@ -145,6 +146,7 @@ def check_samples(session: Session, report: Report) -> None:
             check_copied_columns(session, report)
             check_gravity(session, report)
             check_torque_scales(session, report)
+            check_curves(session, report)
             check_held(session, report)
             check_delay(session, report)
             check_pulls(session, report)

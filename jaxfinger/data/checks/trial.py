@@ -18,6 +18,9 @@ from jaxfinger.errors import counted, listed
 _SEVERAL_PULL = ("VD.2", "VD.3")  # experiments with the tension of several tendons at once
 _MOVES_JOINT = ("ID.2", "ID.3-static", "ID.3-dynamic")
 _STEPPED = ("ID.3-static", "ID.4", "VD.2")
+# Of its median, a tension's travel from the first to the 99th percentile: a motor that keeps a tension holds it to some
+# percent, and a tendon that turns a joint round has to overcome the friction of joint and path both ways.
+_MAX_STEADY = 0.1
 _MAX_UNLIKE = 0.05  # of a joint's travel, by which the angle of another follows it: sensors agree to a few percent
 
 
@@ -171,6 +174,13 @@ def _pulled(trial: Trial, finger: FingerDescription) -> np.ndarray:
     return np.zeros(0) if trial.tendon_force is None or tendon is None else trial.tendon_force[:, tendon]
 
 
+def _all_steady(trial: Trial, finger: FingerDescription) -> bool:
+    """Whether all tensions that are measured are kept constant; false where none is, or all are slack."""
+    tension = np.zeros((0, finger.n)) if trial.tendon_force is None else trial.tendon_force[:, finger.active]
+    measured = [x for x in tension.T if np.isfinite(x).any()]
+    return bool(measured) and all(_span(x) < _MAX_STEADY * median(x) for x in measured)
+
+
 def _span(values: np.ndarray) -> float:
     """Travel of a column, from its first to its 99th percentile; NaN where a sample is not finite."""
     if len(values) == 0 or not np.isfinite(values).all():
@@ -205,6 +215,13 @@ def _motion(trial: Trial, finger: FingerDescription, sizes: Sizes, report: Repor
         trial.experiment in ("VD.1", "VD.3") or (trial.joint is None and trial.experiment in _MOVES_JOINT)
     ) and np.all(spans < still):
         say(place, f"no joint moves, though {trial.experiment} moves them; record it again")
+    if trial.experiment == "VD.3" and (spans > still).any() and _all_steady(trial, finger):
+        message = "no tension changes by a tenth of its size while joints move, as where they are moved by hand"
+        report.warning(
+            trial.place("tendon_force"),
+            f"{message}, and in VD.3 tendons drive the finger; check these columns, or make the trial a VD.1, or an "
+            "ID.2 if one joint moves alone",
+        )
     held = [
         (name, span)
         for name, span, slides in zip(finger.joint_names, spans, finger.prismatic, strict=True)

@@ -23,7 +23,7 @@ from jaxfinger.data.signals.motion import CUTOFF_HZ, STILL_SHARE, directions, fi
 from jaxfinger.errors import listed
 
 # Share of the largest arm at a joint: a tendon whose torque shows more should not stand still, but for its stretch
-# (`Excursions.still`). Small arms lie between.
+# (`Excursions.still`), nor have a small arm (`Excursions.small_arm`), of which friction would leave less still.
 _MIN_FELT_SHARE = 0.5
 # Ratio of the arm that torques show to the arm that excursions show. Friction reduces it: routed tendons lose up to two
 # thirds of their tension (the shipped session). Units that people confuse differ at least fourfold (N and lbf).
@@ -80,15 +80,17 @@ def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> No
         i, k = finger.joint(trial.joint), finger.tendon(trial.tendon)
         if i is None or k is None or trial.joint_torque is None or trial.tendon_force is None:
             continue
-        seen = kinematic.arm(k, i, float(np.nanmedian(trial.q[:, i])))
+        angle = float(np.nanmedian(trial.q[:, i]))
+        seen = kinematic.arm(k, i, angle)
         felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
-        still = kinematic.still(k, i) and abs(felt) > _MIN_FELT_SHARE * kinematic.largest(i)
-        seen = kinematic.arms[k, i] if still else seen
+        strong = abs(felt) > _MIN_FELT_SHARE * kinematic.largest(i)
+        still = strong and kinematic.still(k, i)
+        seen = kinematic.arms[k, i] if still else kinematic.small_arm(k, i, angle) if strong and seen is None else seen
         if seen is None or not np.isfinite(felt):
             continue
         pair = finger.tendon_names[k], finger.joint_names[i]
         said = f"{pair[0]} at {pair[1]} ({1e3 * seen:.3g} against {1e3 * felt:.3g} mm)"
-        ratio = np.inf if still else felt / seen
+        ratio = np.inf if still or seen == 0.0 else felt / seen
         if ratio < -_MIN_ARM_RATIO:
             turned[pair] = said
         elif not _MIN_ARM_RATIO < ratio < _MAX_ARM_RATIO:

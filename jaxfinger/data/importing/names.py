@@ -93,6 +93,11 @@ def is_nameless(name: str) -> bool:
     return re.fullmatch(_NAMELESS, name.lower()) is not None
 
 
+def is_of_tendon(name: str) -> bool:
+    """Whether a name says that a force is a tendon's, or one of several forces by its number."""
+    return re.search(r"tension|tendon|cable|[张張]力|\d", words(name)) is not None
+
+
 def is_before_a_gear(name: str) -> bool:
     """Whether a column is of a motor by its name, so that a gear may be between it and the joint."""
     return re.search(f"{MOTOR}|{_OF_DRIVE}", words(name)) is not None

@@ -16,6 +16,7 @@ from jaxfinger.data.importing.names import (
     is_electric,
     is_joint,
     is_nameless,
+    is_of_tendon,
     is_position,
     meaning_of,
     words,
@@ -53,6 +54,12 @@ GEARED = "it may be in rad, in degrees or, as drives count, in turns; of a motor
 # are in N mm: in N cm they would be twenty times it. Between them the unit stays open.
 _WEIGHTS = 3.0, 2000.0
 _MIN_DATE = 1e4  # days: spreadsheets count them from 1900, and MATLAB from the year 0.
+# Of a force's larger side of zero, the smaller one from which it pushes as well as pulls: a tension only reads below
+# zero by its noise and by a tare that is off, a few percent of its range.
+_MIN_PUSH = 0.2
+# Of a column's scatter, that of its steps: that of white noise about zero, as of a slack tendon's force, is 1.4.
+_MAX_ROUGH = 0.5
+PUSHES = "it pushes and pulls, as no tendon does: of a load cell on a lever write `scale`, the arm in m, and units N m"
 # Ranges of the usual interval, 10 µs to 0.5 s, in each unit. Where they overlap the first one counts.
 _INTERVALS = (("s", 1e-5, 0.5), ("ms", 0.01, 500.0), ("us", 10.0, 5e5), ("ns", 1e4, 5e8))
 
@@ -130,7 +137,9 @@ def columns_of(
             whole = len(finite) > 0 and bool(np.all(finite == np.round(finite)) and np.ptp(finite) > 0.0)
             counts = whole and meaning in _MAX_VALUES and meaning != "temperature"
             doubt = ""
-            if not (units or foreign or counts):
+            if meaning == "tendon_force" and not counts and _pushes(name, k, recording, among, owners):
+                meaning, units, doubt = "joint_torque", "", PUSHES
+            elif not (units or foreign or counts):
                 sizes = _sizes(name, k, recording, among)
                 units = _time_unit(x) if meaning == "time" else _unit(meaning, sizes, weight)
                 if meaning == "q" and finite.any():
@@ -150,6 +159,21 @@ def columns_of(
                 found[k] = replace(s, meaning="time", units=s.units or _time_unit(x))
                 break
     return found
+
+
+def _pushes(name: str, k: int, recording: Recording, among: Sequence[Recording], owners: Owners) -> bool:
+    """Whether a force that no name calls a tendon's goes well beyond zero both ways in some recording, and smoothly."""
+    if is_of_tendon(name) or owners.of(words(name))[0]:
+        return False
+    for variable in _alike(name, recording, among):
+        x = variable.values.reshape(len(variable.values), -1)[:, k] if k < len(variable.sizes) else np.zeros(0)
+        x = x[np.isfinite(x)]
+        if len(x) < 3 or np.std(np.diff(x)) > _MAX_ROUGH * np.std(x):
+            continue
+        sides = sorted((max(-x.min(), 0.0), max(x.max(), 0.0)))
+        if sides[0] > _MIN_PUSH * sides[1]:
+            return True
+    return False
 
 
 def _angle(name: str, variable: Variable, units: str, owners: Owners, beside: Mapping[str, str]) -> tuple[str, str]:
@@ -279,10 +303,14 @@ def _of_one_quantity(
 
 def _sizes(name: str, k: int, recording: Recording, among: Sequence[Recording]) -> list[float]:
     """Sizes of column `k` of a variable, in its recording and in those of `among` with the same columns and units."""
+    return [v.sizes[k] for v in _alike(name, recording, among) if k < len(v.sizes)]
+
+
+def _alike(name: str, recording: Recording, among: Sequence[Recording]) -> list[Variable]:
+    """A variable in its recording and in those of `among` where it has the same columns and units."""
     variable = recording.variables[name]
     alike = [variable, *(v for other in among if (v := other.variables.get(name)) is not None)]
-    same = [v for v in alike if (v.columns, v.units) == (variable.columns, variable.units)]
-    return [v.sizes[k] for v in same if k < len(v.sizes)]
+    return [v for v in alike if (v.columns, v.units) == (variable.columns, variable.units)]
 
 
 def clocks_of(recording: Recording, seen: Sequence[ColumnSurvey]) -> list[ClockSurvey]:

@@ -34,3 +34,14 @@ def test_where_several_joints_move_and_the_torque_is_missing_no_joint_is_asked_f
     still = replace(moved, q=0.0 * moved.q + 0.1)
     said = complaints(replace(session, trials={**session.trials, name: still}))
     assert any(name in text and "has no attribute `joint`" in text for text in said)
+
+
+def test_a_motion_by_hand_that_is_labelled_a_driven_one_is_said(session):
+    """Tendons at constant tension drive nothing, whatever the noise of their sensors, or a passive tendon's."""
+    words = "07-VD.3/tendon_force: no tension changes by a tenth of its size while joints move"
+    trial = session["07-VD.3"]
+    by_hand = replace(trial, tendon_force=session["01-ID.2-MCP"].tendon_force)
+    slack = replace(trial, tendon_force=0.0 * trial.tendon_force)
+    assert not any(words in text for text in complaints(session))
+    assert any(words in text for text in complaints(replace(session, trials={trial.name: by_hand})))
+    assert not any(words in text for text in complaints(replace(session, trials={trial.name: slack})))

@@ -115,6 +115,15 @@ def test_an_excursion_that_stands_still_is_said_though_it_has_noise(sound):
     assert any("T1 at MCP (" in text and "against 5 mm); check the units or the column" in text for text in said)
 
 
+@pytest.mark.parametrize("factor", [0.1, -0.1])
+def test_an_arm_that_is_small_beside_the_others_is_said_where_the_torque_is_not(sound, factor):
+    """One column in cm read as mm: the arm is a tenth of the others, as that of a tendon near the axis may be."""
+    trial = sound["01-ID.2-MCP"]
+    scaled = replace(trial, tendon_excursion=trial.tendon_excursion * [factor, 1.0, 1.0])
+    said = complaints(replace(sound, trials={**sound.trials, trial.name: scaled}))
+    assert any(f"T1 at MCP ({8 * factor:.3g} against 5 mm)" in text for text in said), said
+
+
 def test_a_fingertip_on_the_last_axis_is_said_where_it_presses(sound):
     """Where nothing is pressed, nobody needs the contact point."""
     axial = replace(sound, finger=replace(sound.finger, fingertip=np.array([0.0, 0.01, 0.0])))

@@ -471,3 +471,23 @@ def test_a_clock_that_wraps_after_its_bits_is_unwrapped(tmp_path, bits, unwraps)
     said = proposal([load_recording(tmp_path / "log.csv")])
     assert (f'time = {{ from = "t_ms", units = "ms", unwrap = {2**bits} }}' in said) == unwraps
     assert ("the time begins again" in said) != unwraps
+
+
+def test_a_force_that_pushes_and_pulls_is_of_a_lever_and_no_tension(tmp_path):
+    """Else it is read as the first tendon's tension, and the trial as an ID.2. The unit stays open, as the arm is."""
+    rng = np.random.default_rng(0)
+
+    def said(force, name="force_N", cell="tension_T1"):
+        rows = zip(TIME, SWEEP, force, 2.0 + 0.1 * rng.standard_normal(400), strict=True)
+        lines = [f"{t:.3f},{np.degrees(q):.4f},{f:.5f},{pull:.4f}" for t, q, f, pull in rows]
+        path = tmp_path / "log.csv"
+        path.write_text("\n".join([f"t,angle_MCP,{name},{cell}", *lines, ""]))
+        return proposal([load_recording(path)])
+
+    lever = said(3.0 * (SWEEP - 0.5) + 0.02 * rng.standard_normal(400))
+    assert 'experiment = "ID.3-' in lever
+    assert '{ from = "force_N", units = "?" }   # it pushes and pulls, as no tendon does' in lever
+    slack = said(0.02 * rng.standard_normal(400))
+    assert "joint_torque" not in slack
+    assert "joint_torque" not in said(5.0 * (SWEEP - 0.02) ** 2 - 0.1)  # a tare that is off
+    assert "joint_torque" not in said(3.0 * (SWEEP - 0.5), name="tension_T2")
