@@ -161,31 +161,16 @@ def _report_other_names(finger: FingerDescription, of_session: FingerDescription
             report.error(f"/finger/{what}s/name", f"{said}; give the columns of the session's {what}s, in its order")
 
 
-def _inputs(trials: h5py.Group) -> list[str]:
-    """Channels that some trials of a file hold and no model predicts of their experiments, but reads."""
-    found = set()
-    for name in trials:
-        trial = trials.get(name)
-        if isinstance(trial, h5py.Group):
-            predicted = {"q"} if text_attribute(trial, "experiment", f"/trials/{name}", Report()) == "VD.3" else set()
-            found |= {"q", "tendon_force"} & trial.keys() - predicted
-    return sorted(found)
-
-
 def _parse(file: h5py.File, session: Session | None, report: Report) -> dict[str, dict[str, np.ndarray]]:
     finger = parse_finger(file, report) if parse_version(file, report) else None
     if finger is not None and session is not None:
         _report_other_names(finger, session.finger, report)
+    if text_attribute(file, "content", "/", Report()) != "predictions":
+        said = "has no attribute `content` that says `predictions`, and may hold recordings"
+        report.warning("/", f"{said}; write it if these are predictions")
     trials = child(file, "trials", "/trials", report, h5py.Group) if finger is not None else None
     if finger is None or trials is None:
         return {}
-    if text_attribute(file, "content", "/", Report()) != "predictions":
-        said = "has no attribute `content` that says `predictions`, and"
-        if inputs := _inputs(trials):
-            mend = "give what a simulator predicts of the session's trials, or write the attribute if this is it"
-            report.error("/", f"{said} holds {listed(inputs)} as a recorded session does; {mend}")
-            return {}
-        report.warning("/", f"{said} may hold recordings; write it if these are predictions")
     found = {}
     for name in trials:
         place = f"/trials/{name}"

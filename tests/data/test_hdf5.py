@@ -202,30 +202,11 @@ def test_predictions_of_another_finger_are_refused(session, tmp_path):
         read_predictions(tmp_path / "p.h5", session)
 
 
-@pytest.mark.parametrize(
-    ("lacks", "holds"), [("hold", "q, tendon_force"), ("tendon_force", "q"), ("q", "tendon_force")]
-)
-def test_a_recorded_session_in_place_of_predictions_is_refused(session, tmp_path, lacks, holds):
-    path = tmp_path / "recorded.h5"
+def test_recordings_in_place_of_predictions_are_doubted(session, tmp_path):
+    path, report = tmp_path / "recorded.h5", Report()
     write_session(session, path)
-    with h5py.File(path, "r+") as file:
-        for trial in file["trials"].values():
-            trial.pop(lacks, None)
-    says = rf"recorded\.h5: has no attribute `content` .*, and holds {holds} as a recorded session does; give what a"
-    with pytest.raises(UserError, match=says):
-        read_predictions(path, session)
-
-
-def test_predictions_that_do_not_say_what_they_are_are_doubted(session, tmp_path):
-    """They hold nothing that a simulator reads, but angles of VD.3, which it predicts."""
-    path, report = tmp_path / "p.h5", Report()
-    torque = session["02-ID.3-static-PIP"].joint_torque
-    told = {"07-VD.3": {"q": session["07-VD.3"].q}, "02-ID.3-static-PIP": {"joint_torque": torque}}
-    write_predictions(path, session, told)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["content"]
-    assert set(read_predictions(path, session, report)) == set(told)
-    assert [(x.severity, "may hold recordings" in x.message) for x in report] == [("warning", True)]
+    read_predictions(path, session, report)
+    assert ["has no attribute `content` that says `predictions`" in x.message for x in report] == [True]
 
 
 def test_a_column_of_a_finger_with_joints_of_both_kinds_has_the_units_of_its_joint():
