@@ -74,8 +74,9 @@ class Excursions:
     def arm(self, tendon: int, joint: int, angle: float) -> float | None:
         """Moment arm dl/dq, m/rad, at an angle; None where it is unknown or so small that it may change sign."""
         arm = self._slope(tendon, joint, angle)
-        large = arm is not None and abs(arm) > _MIN_ARM_SHARE * self.largest(joint)
-        return arm if large and arm * self.arms[tendon, joint] > 0.0 else None
+        if arm is None or abs(arm) <= _MIN_ARM_SHARE * self.largest(joint):
+            return None
+        return arm if arm * self.arms[tendon, joint] > 0.0 else None
 
     def small_arm(self, tendon: int, joint: int, angle: float) -> float | None:
         """Moment arm dl/dq, m/rad, at an angle, where it is small beside the largest at the joint; None elsewhere."""
@@ -85,10 +86,10 @@ class Excursions:
     def _slope(self, tendon: int, joint: int, angle: float) -> float | None:
         """The polynomial's dl/dq, m/rad, at an angle; None where it is unknown."""
         p = self.polynomials.get((tendon, joint))
-        beyond = 0.0 if p is None else _MAX_BEYOND * np.ptp(p.domain)
-        if p is None or not p.domain[0] - beyond <= angle <= p.domain[1] + beyond:
+        if p is None:
             return None
-        return float(p.deriv()(angle))
+        beyond = _MAX_BEYOND * np.ptp(p.domain)
+        return float(p.deriv()(angle)) if p.domain[0] - beyond <= angle <= p.domain[1] + beyond else None
 
     def largest(self, joint: int) -> float:
         """Size of the largest mean moment arm at a joint, m/rad; 0 where none is known."""
