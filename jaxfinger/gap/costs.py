@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from math import fsum, log
 
 import numpy as np
 from jaxtyping import Float
@@ -27,7 +28,10 @@ CauseKey = tuple[str, Site]  # A cause in the search: id of the effect, and site
 
 @dataclass(frozen=True)
 class Costs:
-    """Costs of all sets of causes that the trials of one file can see."""
+    """Costs of all sets of causes that the trials of one file can see.
+
+    Sums are rounded once (`fsum`), so that they do not depend on the order of a set, which differs between processes.
+    """
 
     parameters: Parameters
     unexplained: Float[np.ndarray, " C"]  # u_c, nats
@@ -50,7 +54,7 @@ class Costs:
         """
         keys = list(keys)
         effects = {e for e, _ in keys} - set(NOMINAL_TERMS)
-        return len(effects) * np.log(len(self.sites) or 1) + sum(np.log(self.sites.get(e, 1) or 1) for e, _ in keys)
+        return len(effects) * log(len(self.sites) or 1) + fsum(log(self.sites.get(e, 1) or 1) for e, _ in keys)
 
     @cached_property
     def _evidence_where_it_acts(self) -> Mapping[CauseKey, float]:
@@ -60,7 +64,7 @@ class Costs:
     def evidence_needed(self, keys: Iterable[CauseKey]) -> float:
         """Log evidence that a set's causes must bring, summed over the causes."""
         p, there = self.parameters, self._evidence_where_it_acts
-        return sum(p.cause_cost + p.imitator_gain * there[key] for key in keys)
+        return fsum(p.cause_cost + p.imitator_gain * there[key] for key in keys)
 
     def probabilities(self, scores: Mapping[frozenset[CauseKey], float]) -> dict[frozenset[CauseKey], float]:
         """Posterior probability of every set, ∝ exp(β (score − evidence needed) − log odds)."""

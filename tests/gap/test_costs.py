@@ -1,6 +1,7 @@
 """Costs of sets of causes, and the probabilities that follow from them."""
 
 from dataclasses import replace
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -22,6 +23,15 @@ STRETCH, FURTHER, STRIBECK = ("tendon_stretch", ("T1",)), ("tendon_stretch", ("T
 def test_one_cause_at_a_further_site_costs_less_than_another_cause():
     assert COSTS.of([STRETCH, FURTHER]) < COSTS.of([STRETCH, STRIBECK])
     assert COSTS.of([STRETCH, FURTHER]) > COSTS.of([STRETCH]) > COSTS.of([]) == 0.0
+
+
+def test_a_cost_does_not_depend_on_the_order_of_its_causes():
+    """To the last bit: sets have another order in every process."""
+    unlike = {key: share * np.sqrt(2.0 + k) for k, (key, share) in enumerate(EXPLAINABLE.items())}
+    costs = Costs(Parameters(), np.array([np.pi, np.e]), unlike)
+    assert len({costs.of(keys) for keys in permutations(unlike, 5)}) == len(
+        {frozenset(k) for k in combinations(unlike, 5)}
+    )
 
 
 def test_what_is_unexplained_raises_the_cost_of_causes_that_act_there():
