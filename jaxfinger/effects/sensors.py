@@ -223,13 +223,15 @@ def read_later(y: Float[Array, "*T"], time: Float[Array, "*#T"], by: Float[Array
 @partial(jnp.vectorize, signature="(t),(t),()->(t)")
 def _shifted(y, time, by):
     size, lead = time.size, time.size // 2
-    last = jnp.maximum(jnp.sum(jnp.diff(time) > 0.0), 1)
-    lasts = jnp.where(time[-1] > time[0], time[-1] - time[0], 1.0)
-    slope = (y[-1] - y[0]) / lasts
-    level = y - y[0] - slope * (time - time[0])  # zero at both ends, so that its reflections have a period
+    last = jnp.maximum(jnp.sum(jnp.diff(time) > 0.0), 1)  # index of the last sample before the padding
+    duration = jnp.where(time[-1] > time[0], time[-1] - time[0], 1.0)
+    slope = (y[-1] - y[0]) / duration
+    level = y - y[0] - slope * (time - time[0])  # zero at both ends
+    # The trial between its odd reflections at both ends, of period 2 last. They fade out from a quarter to half of its
+    # length away, since the discrete Fourier transform joins its own two ends.
     place = (jnp.arange(2 * size) - lead) % (2 * last)
     reflected = jnp.where(place <= last, level[jnp.minimum(place, last)], -level[2 * last - jnp.maximum(place, last)])
     spectrum = jnp.fft.rfft(reflected * tukey(2 * size, 0.25))
-    phase = 2.0 * np.pi * np.fft.rfftfreq(2 * size) * (by * last.astype(by.dtype) / lasts)
+    phase = 2.0 * np.pi * np.fft.rfftfreq(2 * size) * (by * last.astype(by.dtype) / duration)
     change = jnp.fft.irfft(spectrum * jax.lax.complex(jnp.cos(phase) - 1.0, jnp.sin(phase)), 2 * size)
     return y + slope * by + change[lead : lead + size]

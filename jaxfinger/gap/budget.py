@@ -27,12 +27,14 @@ DRAWS = 400  # Draws of the bootstrap over trials: the quantiles of a 95 % inter
 # Log evidence from which a column is said to have a gap: the same at which, over all columns, something unlisted is as
 # likely as not (`formula.Parameters.unlisted_threshold`).
 MIN_GAP_EVIDENCE = 6.0
-# Shares are relative to a gap of at least 0.05 in mean square of the noise. Below that, noise divides noise.
+# Shares are relative to a gap of at least 0.05 in mean square of the noise. Below that, noise divides noise: the mean
+# square of N white rows has a standard deviation of √(2/N), which is 0.05 for the 800 rows of a column.
 MIN_RELATIVE_GAP = 0.05
-# Likewise for the rows of all columns together. They are more, and their mean square is known better.
+# Likewise for the rows of all columns together: √(2/N) is 0.01 for 20 000.
 MIN_RELATIVE_GAP_OF_ALL = 0.01
-# Relative. Keeps products invertible where the seen trials do not show a column, or do not tell it from others: the
-# share of FOLD_PRIOR, which is relative to the largest column, is less than rounding there.
+# Of the square of a column scaled to length 1. It keeps products invertible where the seen trials do not show a column,
+# or do not tell it from others, since FOLD_PRIOR, relative to the largest column, may be below rounding there. Rounding
+# of such products is some 1e-13; a column that 1e-11 of its square could hold back is not told from others.
 RIDGE = 1e-11
 
 

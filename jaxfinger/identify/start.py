@@ -47,7 +47,7 @@ def start_values(
 
 
 def bounded_losses(
-    model: Model, free: np.ndarray, parameters: list[Parameter], highest: Float[np.ndarray, " n"]
+    model: Model, free: Int[np.ndarray, " p"], parameters: list[Parameter], highest: Float[np.ndarray, " n"]
 ) -> dict[str, str]:
     """Tendons whose friction is free and at a bound: `none` or `all` of the tension is lost, by name.
 

@@ -14,7 +14,7 @@ from jaxfinger.experiments import EXPERIMENTS
 from jaxfinger.identify.identifiability import REMEDIES
 from jaxfinger.identify.parameters import Parameter
 
-_WORDS = {"moment_arm": "moment arms", "elastic": "elastic torque", "tendon_friction": "tendon friction"}  # of groups
+_WORDS = {"moment_arm": "moment arms", "elastic": "elastic torque"}  # of groups that their names do not say
 
 
 class Coverage(NamedTuple):
@@ -102,7 +102,7 @@ def name_unfitted(
     missing: dict[str, list[str]] = {}
     for (group, name), has in laws.items():
         if not any(has):
-            missing.setdefault(_WORDS.get(group, group), []).append(name)
+            missing.setdefault(_WORDS.get(group, group.replace("_", " ")), []).append(name)
     said = ", and the ".join(f"{words} of {listed(names)}" for words, names in missing.items())
     return [f"no trial of the fit showed the {said}, and predictions take them as zero"] if said else []
 

@@ -11,7 +11,9 @@ from jaxfinger.data.session import Trial
 from jaxfinger.data.signals.motion import STILL_SHARE, directions
 
 _BLOCKS = 300  # of a trial, of which means are taken: the protocol's quickest cycle still has ten of them.
-MIN_POSTURE = 0.2  # rad between two postures: the weight's curve moves by as much.
+# rad between two postures. A joint that turns by less shifts the curve of a weight over another joint's angle by no
+# more, so that the two curves count as one.
+MIN_POSTURE = 0.2
 
 
 class Motion(NamedTuple):

@@ -85,7 +85,10 @@ def _virtual_work(session: Session, kinematic: Excursions, report: Report) -> No
         felt = -slope(thinned(trial.tendon_force[:, k]), thinned(trial.joint_torque[:, i]))
         strong = abs(felt) > _MIN_FELT_SHARE * kinematic.largest(i)
         still = strong and kinematic.still(k, i)
-        seen = kinematic.arms[k, i] if still else kinematic.small_arm(k, i, angle) if strong and seen is None else seen
+        if still:
+            seen = kinematic.arms[k, i]
+        elif strong and seen is None:
+            seen = kinematic.small_arm(k, i, angle)
         if seen is None or not np.isfinite(felt):
             continue
         pair = finger.tendon_names[k], finger.joint_names[i]
